@@ -1,0 +1,232 @@
+"""Build or load a SmolVLA policy, choose what trains, and let it drive the arm.
+
+Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: random weights on
+the nano backbone, a local `pretrained_model` folder, or a hub id such as ``lerobot/smolvla_base``.
+"""
+
+import contextlib
+import io
+import os
+import shutil
+import tempfile
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OfflineModeIsEnabled
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
+from safetensors import safe_open
+
+from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.nano import ensure_nano
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
+
+VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
+
+# Statistics of one feature: {"mean", "std", "min", "max"}: float arrays (6,), {"count"}: int array (1,).
+Stats = dict[str, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A policy with the processors that turn raw batches into its inputs and its outputs into joint targets."""
+
+    policy: SmolVLAPolicy
+    preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
+    postprocess: Any  # normalised actions -> degrees and gripper 0-100
+
+
+def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
+    """Return the policy that `config.base` names, frozen as `config` says, in evaluation mode.
+
+    Args:
+        stats: normalisation statistics of state and action. None takes those saved with the base.
+
+    Raises:
+        ValueError: the base cannot be found or lacks weights, or no statistics are known.
+    """
+    policy = _random_nano(config) if config.base == "nano" else _pretrained(config)
+    policy.eval()
+    if stats is None and config.base == "nano":
+        raise ValueError("base='nano' has no statistics of its own: give those of the training episodes")
+    return Bundle(policy, *_processors(policy, stats, config.base))
+
+
+def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
+    """Return one row per part of the model: module, parameters, trainable parameters and the reader's name for it."""
+    rows = []
+    for prefix, meaning in MODULES.items():
+        named = [p for name, p in policy.named_parameters() if name.startswith(prefix)]
+        trainable = sum(p.numel() for p in named if p.requires_grad)
+        total = sum(p.numel() for p in named)
+        rows.append({"module": prefix, "part": meaning, "parameters": total, "trainable": trainable})
+    return rows
+
+
+MODULES = {
+    "model.vlm_with_expert.vlm.model.vision_model": "vision encoder",
+    "model.vlm_with_expert.vlm.model.connector": "connector (pixel shuffle + projection)",
+    "model.vlm_with_expert.vlm.model.text_model": "language model",
+    "model.vlm_with_expert.vlm.lm_head": "language head (unused by the policy)",
+    "model.vlm_with_expert.lm_expert": "action expert",
+    "model.state_proj": "state projection",
+    "model.action_in_proj": "action input projection",
+    "model.action_out_proj": "action output projection",
+    "model.action_time_mlp": "action-time MLP",
+}
+
+
+def save_policy(bundle: Bundle, folder: Path) -> None:
+    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically.
+
+    Raises:
+        FileExistsError: `folder` is there already; nothing is overwritten.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists already: a saved policy is never overwritten")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch:
+        target = Path(scratch) / "policy"
+        bundle.policy.save_pretrained(target)
+        bundle.preprocess.save_pretrained(target)
+        bundle.postprocess.save_pretrained(target)
+        backbone = Path(bundle.policy.config.vlm_model_name)
+        if backbone.is_dir():
+            shutil.copytree(backbone, target / VLM_FOLDER)
+        os.replace(target, folder)
+
+
+class PolicyActor:
+    """Lets a policy drive the arm: look once, carry out `n_action_steps` of the predicted chunk, look again.
+
+    The flow-matching noise comes from (`seed`, episode seed), so an evaluation can be repeated exactly.
+    """
+
+    def __init__(self, bundle: Bundle, seed: int = 0) -> None:
+        self.bundle = bundle
+        self.seed = seed
+        self._queue: deque[np.ndarray] = deque()
+
+    def reset(self, env: Any, seed: int) -> None:
+        """Forget the last episode and read the instruction of this one."""
+        self._queue.clear()
+        self._instruction = env.instruction
+        mixed = np.random.SeedSequence([self.seed, seed]).generate_state(1, np.uint64)[0]
+        self._generator = torch.Generator().manual_seed(int(mixed >> 1))
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the next joint targets, float32 (6,): degrees, gripper 0-100."""
+        if not self._queue:
+            chunk = predict_chunk(self.bundle, _as_batch(observation, self._instruction), self._generator)
+            self._queue.extend(chunk[0, : self.bundle.policy.config.n_action_steps].numpy())
+        return self._queue.popleft()
+
+
+def predict_chunk(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> torch.Tensor:
+    """Denoise action chunks for a raw batch: float32 (B, chunk_size, 6) on the CPU, in degrees and gripper 0-100."""
+    config = bundle.policy.config
+    inputs = {key: value for key, value in batch.items() if key not in (ACTION_KEY, "action_is_pad")}
+    size = (len(batch["task"]), config.chunk_size, config.max_action_dim)
+    noise = torch.randn(size, generator=generator).to(config.device)
+    chunk = bundle.policy.predict_action_chunk(bundle.preprocess(inputs), noise=noise)  # (B, chunk, 6) normalised
+    return bundle.postprocess(chunk)
+
+
+def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
+    """Turn one Gymnasium observation into a raw batch of one."""
+    batch: dict[str, Any] = {"task": [instruction]}
+    for camera, pixels in observation["pixels"].items():
+        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]  # (1, 3, H, W)
+        batch[image_key(camera)] = image.float() / 255
+    batch[STATE_KEY] = torch.from_numpy(np.asarray(observation["agent_pos"], np.float32))[None]  # (1, 6)
+    return batch
+
+
+def _random_nano(config: Config) -> SmolVLAPolicy:
+    """Random weights that depend on the seed alone, whatever was drawn before."""
+    settings = SmolVLAConfig(
+        vlm_model_name=str(ensure_nano(cache_dir(), config.image_size)),
+        num_vlm_layers=0,  # 0 keeps all layers the backbone has
+        resize_imgs_with_padding=(config.image_size, config.image_size),
+    )
+    _adapt(settings, config)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return SmolVLAPolicy(settings).to(config.device)
+
+
+def _pretrained(config: Config) -> SmolVLAPolicy:
+    base = config.base
+    try:
+        settings = PreTrainedConfig.from_pretrained(base)
+        if not isinstance(settings, SmolVLAConfig):
+            raise ValueError(f"base={base!r} is a {settings.type!r} policy: give a smolvla one")
+        _adapt(settings, config)
+        settings.load_vlm_weights = False  # the policy's own file holds them, fine-tuned
+        if (Path(base) / VLM_FOLDER).is_dir():
+            settings.vlm_model_name = str((Path(base) / VLM_FOLDER).resolve())
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line per load
+            policy = SmolVLAPolicy.from_pretrained(base, config=settings)
+    except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
+        raise ValueError(_not_found(base, error)) from error
+    _require_all_weights(policy, base)
+    return policy
+
+
+def _not_found(base: str, error: Exception) -> str:
+    reason = str(error).strip().splitlines()[0][:160]
+    return (
+        f"base={base!r} could not be loaded ({reason}): give 'nano', a folder in LeRobot's pretrained_model format, "
+        "or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
+    )
+
+
+def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:
+    """LeRobot only logs missing tensors; a policy that is partly random must not pass for a pretrained one."""
+    file = Path(base) / "model.safetensors"
+    if not file.is_file():
+        return  # from the hub cache: the file's place is LeRobot's business
+    with safe_open(file, "pt") as weights:
+        missing = sorted(set(policy.state_dict()) - set(weights.keys()))
+    if missing:
+        raise ValueError(f"{file} lacks {len(missing)} tensors of the policy, {missing[0]!r} first")
+
+
+def _adapt(settings: SmolVLAConfig, config: Config) -> None:
+    """Set what a run decides: cameras and sizes, chunk, device, and what is frozen."""
+    shape = (3, config.image_size, config.image_size)
+    settings.input_features = {image_key(camera): PolicyFeature(FeatureType.VISUAL, shape) for camera in CAMERAS}
+    settings.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))
+    settings.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
+    settings.chunk_size = config.chunk_size
+    settings.n_action_steps = config.n_action_steps
+    settings.freeze_vision_encoder = config.freeze_vision_encoder
+    settings.train_expert_only = config.train_expert_only
+    settings.device = config.device
+
+
+def _processors(policy: SmolVLAPolicy, stats: Stats | None, base: str) -> tuple[Any, Any]:
+    if stats is not None:
+        return make_pre_post_processors(policy.config, dataset_stats=_as_tensors(stats))
+    overrides = {
+        "device_processor": {"device": str(policy.config.device)},
+        "tokenizer_processor": {"tokenizer_name": policy.config.vlm_model_name},
+    }
+    return make_pre_post_processors(policy.config, pretrained_path=base, preprocessor_overrides=overrides)
+
+
+def _as_tensors(stats: Stats) -> dict[str, dict[str, torch.Tensor]]:
+    """A missing key would silently skip normalisation in LeRobot, so its absence is an error here."""
+    for key in (STATE_KEY, ACTION_KEY):
+        if not {"mean", "std"} <= set(stats.get(key, ())):
+            raise ValueError(f"statistics lack mean and std of {key!r}: got {sorted(stats)}")
+    return {
+        key: {name: torch.as_tensor(np.asarray(value), dtype=torch.float32) for name, value in feature.items()}
+        for key, feature in stats.items()
+    }

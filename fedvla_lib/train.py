@@ -1,0 +1,211 @@
+"""Local training and validation of one policy: what a client does between two messages.
+
+Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's own flow-matching loss with
+padded actions masked.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.common.train_utils import load_training_state, save_training_state
+from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
+from safetensors.torch import load_file, save_file
+from tqdm.auto import tqdm
+
+from fedvla_lib.config import Config, granted_threads
+from fedvla_lib.model import Bundle, predict_chunk
+from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES
+
+WEIGHTS_FILE = "trainable.safetensors"
+LOSSES_FILE = "losses.json"
+
+
+class TrainingBatches(Protocol):
+    """An endless, seekable supply of raw batches: `data.Batches`."""
+
+    seed: int
+    num_examples: int
+
+    def at(self, step: int) -> dict[str, Any]:
+        """Return the raw batch of a step; the same step gives the same batch."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a client reports after local training."""
+
+    losses: list[float]  # flow-matching loss of each step, in order
+    num_examples: int  # training frames of the client: its weight in federated averaging
+    steps: int  # optimiser steps done in this call
+    seconds: float  # wall time of this call
+
+
+def local_train(
+    bundle: Bundle,
+    batches: TrainingBatches,
+    config: Config,
+    *,
+    steps: int,
+    start_step: int = 0,
+    total_steps: int | None = None,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: bool = True,
+) -> TrainResult:
+    """Train the policy's trainable parameters in place for `steps` steps, from `start_step` of a schedule.
+
+    Args:
+        start_step: steps done in earlier rounds; sets the place in the data and in the learning-rate schedule.
+        total_steps: length of the schedule; default `start_step + steps`.
+        checkpoint_dir: where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end.
+        resume: continue from the newest checkpoint in `checkpoint_dir`; the result is bit for bit the same.
+
+    Raises:
+        FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
+    """
+    torch.set_num_threads(granted_threads(config))
+    started = time.perf_counter()
+    with _seeded(batches.seed, start_step):
+        optimizer, scheduler = _optimizer(bundle, config, start_step, total_steps or start_step + steps)
+        losses = _restore(bundle, optimizer, scheduler, checkpoint_dir) if resume else []
+        bundle.policy.train()
+        bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
+        for step in bar:
+            losses.append(_step(bundle, batches.at(start_step + step), optimizer, scheduler))
+            if not np.isfinite(losses[-1]):
+                raise FloatingPointError(f"loss is {losses[-1]} at step {start_step + step}: lower lr={config.lr}")
+            bar.set_postfix(loss=f"{losses[-1]:.3f}")
+            if checkpoint_dir and _is_due(step + 1, steps, config.checkpoint_every):
+                _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoint_dir))
+        bundle.policy.eval()
+    return TrainResult(losses, batches.num_examples, steps, time.perf_counter() - started)
+
+
+@torch.no_grad()
+def validate(
+    bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0
+) -> dict[str, float]:
+    """Measure the policy on held-out raw batches with fixed noise and flow time, so that models can be compared.
+
+    Returns:
+        loss: flow-matching loss per valid action entry, in normalised units;
+        action_error: mean absolute error of the predicted joint targets, over all joints (degrees; gripper 0-100);
+        action_accuracy: share of predicted joint targets within `tolerance` of the demonstration;
+        action_error.<joint>: the same error for each joint.
+    """
+    if not batches:
+        raise ValueError("no held-out batches: give at least one validation episode")
+    generator = torch.Generator().manual_seed(seed)
+    loss_sum, errors = 0.0, []
+    for batch in batches:
+        valid = ~batch["action_is_pad"]  # (B, chunk)
+        loss_sum += _fixed_loss(bundle, batch, generator) * int(valid.sum())
+        difference = predict_chunk(bundle, batch, generator) - batch[ACTION_KEY]  # (B, chunk, 6)
+        errors.append(difference.abs()[valid].numpy())
+    error = np.concatenate(errors).astype(np.float64)  # (valid actions, 6)
+    by_joint = {f"action_error.{name}": float(e) for name, e in zip(JOINT_NAMES, error.mean(axis=0), strict=True)}
+    return {
+        "loss": loss_sum / len(error),
+        "action_error": float(error.mean()),
+        "action_accuracy": float((error <= tolerance).mean()),
+        **by_joint,
+    }
+
+
+def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> float:
+    """Flow-matching loss with noise ~ N(0, 1) and time spread evenly over (0, 1): x_t = t noise + (1 - t) action."""
+    settings = bundle.policy.config
+    size = len(batch["task"])
+    noise = torch.randn((size, settings.chunk_size, settings.max_action_dim), generator=generator)
+    times = (torch.randperm(size, generator=generator) + 0.5) / size
+    inputs = bundle.preprocess(dict(batch))
+    loss, _ = bundle.policy.forward(inputs, noise=noise.to(settings.device), time=times.to(settings.device))
+    return loss.item()
+
+
+def _step(bundle: Bundle, batch: dict[str, Any], optimizer: torch.optim.Optimizer, scheduler: Any) -> float:
+    loss, _ = bundle.policy.forward(bundle.preprocess(batch))
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(_trainable(bundle), bundle.policy.config.optimizer_grad_clip_norm)
+    optimizer.step()
+    scheduler.step()
+    return loss.item()
+
+
+def _trainable(bundle: Bundle) -> list[torch.nn.Parameter]:
+    return [p for p in bundle.policy.parameters() if p.requires_grad]
+
+
+def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
+    """SmolVLA's AdamW and cosine-with-warm-up presets, at the run's rate and length, standing at `start_step`."""
+    settings = bundle.policy.config
+    optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(_trainable(bundle))
+    floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of last to peak rate
+    preset = replace(
+        settings.get_scheduler_preset(),
+        peak_lr=config.lr,
+        decay_lr=floor,
+        num_warmup_steps=config.warmup_steps,
+        num_decay_steps=total_steps,
+    )
+    scheduler = preset.build(optimizer, total_steps)
+    scheduler.last_epoch = start_step
+    for group in optimizer.param_groups:
+        group["lr"] = config.lr * scheduler.lr_lambdas[0](start_step)
+    return optimizer, scheduler
+
+
+@contextmanager
+def _seeded(seed: int, start_step: int) -> Iterator[None]:
+    """Draw noise and flow time from (seed, start_step) and leave the caller's random state as it was."""
+    before = get_rng_state()
+    set_seed(int(np.random.SeedSequence([seed, start_step]).generate_state(1)[0]))
+    try:
+        yield
+    finally:
+        set_rng_state(before)
+
+
+def _is_due(done: int, steps: int, every: int) -> bool:
+    return done == steps or (every > 0 and done % every == 0)
+
+
+def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[float], folder: Path) -> None:
+    """Write ``step_NNNNNN`` whole or not at all: weights, optimiser, schedule, random state, losses."""
+    target = folder / f"step_{len(losses):06d}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
+        made = Path(scratch) / "checkpoint"
+        save_training_state(made, len(losses), optimizer, scheduler)
+        weights = {n: p.detach().contiguous() for n, p in bundle.policy.named_parameters() if p.requires_grad}
+        save_file(weights, made / WEIGHTS_FILE)
+        (made / LOSSES_FILE).write_text(json.dumps(losses))
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(made, target)
+
+
+def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, folder: Path | None) -> list[float]:
+    """Load the newest checkpoint in place and return the losses so far; an empty list when there is none."""
+    found = sorted(Path(folder).glob("step_*")) if folder else []
+    if not found:
+        return []
+    load_training_state(found[-1], optimizer, scheduler)
+    saved = load_file(found[-1] / WEIGHTS_FILE)
+    own = {name: p for name, p in bundle.policy.named_parameters() if p.requires_grad}
+    if set(saved) != set(own):
+        raise ValueError(f"{found[-1]} holds {len(saved)} trainable arrays, the policy has {len(own)}: another setup")
+    with torch.no_grad():
+        for name, parameter in own.items():
+            parameter.copy_(saved[name])
+    return json.loads((found[-1] / LOSSES_FILE).read_text())

@@ -1,0 +1,119 @@
+"""The policy: same classes for every base, exact round trip to disk, honest failures, reproducible driving."""
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.smolvla import SmolVLAPolicy
+from safetensors.torch import load_file, save_file
+
+from fedvla_lib import config as configs
+from fedvla_lib import model
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY
+
+CONFIG = configs.from_profile("tiny", num_threads=1)
+STATS = {key: {"mean": np.arange(6.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
+SCENE = SimpleNamespace(instruction="Lift the red cube.")
+
+
+def observation(seed=0):
+    rng = np.random.default_rng(seed)
+    size = CONFIG.image_size
+    pixels = {camera: rng.integers(0, 255, (size, size, 3), np.uint8) for camera in CAMERAS}
+    return {"pixels": pixels, "agent_pos": rng.normal(size=6).astype(np.float32)}
+
+
+def drive(bundle, steps=5, seed=0, episode=7, scene=SCENE):
+    actor = model.PolicyActor(bundle, seed)
+    actor.reset(scene, episode)
+    return np.stack([actor.act(observation(i)) for i in range(steps)])
+
+
+@pytest.mark.unit
+def test_the_seed_fixes_the_random_weights():
+    first, second = (model.load_policy(CONFIG, STATS).policy.state_dict() for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = model.load_policy(replace(CONFIG, seed=1), STATS).policy.state_dict()
+    assert any(not torch.equal(first[name], other[name]) for name in first)
+
+
+@pytest.mark.unit
+def test_a_saved_policy_drives_the_same_after_it_was_moved(tmp_path):
+    bundle = model.load_policy(CONFIG, STATS)
+    model.save_policy(bundle, tmp_path / "a" / "policy")
+    shutil.move(tmp_path / "a", tmp_path / "b")
+    loaded = model.load_policy(replace(CONFIG, base=str(tmp_path / "b" / "policy")))
+    assert isinstance(loaded.policy, SmolVLAPolicy)
+    np.testing.assert_array_equal(drive(bundle), drive(loaded))
+    with pytest.raises(FileExistsError, match="never overwritten"):
+        model.save_policy(bundle, tmp_path / "b" / "policy")
+
+
+@pytest.mark.unit
+def test_driving_depends_on_seed_and_instruction_only():
+    bundle = model.load_policy(CONFIG, STATS)
+    first = drive(bundle)
+    assert first.shape == (5, 6) and first.dtype == np.float32
+    torch.manual_seed(99)
+    np.testing.assert_array_equal(first, drive(bundle))
+    assert not np.array_equal(first, drive(bundle, episode=8))
+    assert not np.array_equal(first, drive(bundle, scene=SimpleNamespace(instruction="Push the blue cube.")))
+
+
+@pytest.mark.unit
+def test_actions_come_out_in_the_units_of_the_statistics():
+    shifted = {STATE_KEY: STATS[STATE_KEY], ACTION_KEY: {"mean": np.arange(6.0) + 40, "std": np.full(6, 5.0)}}
+    near, far = (drive(model.load_policy(CONFIG, stats)) for stats in (STATS, shifted))
+    np.testing.assert_allclose(far - near, 40, atol=1e-4)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("freeze", "expert_only", "trained"),
+    [(True, True, {"expert"}), (True, False, {"expert", "text"}), (False, False, {"expert", "text", "vision"})],
+)
+def test_what_trains_is_what_the_config_says(freeze, expert_only, trained):
+    config = replace(CONFIG, freeze_vision_encoder=freeze, train_expert_only=expert_only)
+    policy = model.load_policy(config, STATS).policy
+    rows = {row["module"].rsplit(".", 1)[-1]: row for row in model.module_table(policy)}
+    assert (rows["vision_model"]["trainable"] > 0) == ("vision" in trained)
+    assert (rows["text_model"]["trainable"] > 0) == ("text" in trained)
+    assert rows["lm_expert"]["trainable"] == rows["lm_expert"]["parameters"] > 0
+    assert sum(row["parameters"] for row in rows.values()) == sum(p.numel() for p in policy.parameters())
+    assert sum(row["trainable"] for row in rows.values()) == sum(p.numel() for p in policy.parameters() if p.requires_grad)
+
+
+@pytest.mark.unit
+def test_bad_bases_are_named(tmp_path):
+    with pytest.raises(ValueError, match="no-such-folder.*'nano'.*hub id"):
+        model.load_policy(replace(CONFIG, base=str(tmp_path / "no-such-folder")), STATS)
+    with pytest.raises(ValueError, match="nobody/nothing"):
+        model.load_policy(replace(CONFIG, base="nobody/nothing"), STATS)
+    with pytest.raises(ValueError, match="statistics"):
+        model.load_policy(CONFIG)
+    with pytest.raises(ValueError, match="observation.state"):
+        model.load_policy(CONFIG, {ACTION_KEY: STATS[ACTION_KEY]})
+
+
+@pytest.mark.unit
+def test_a_partly_random_policy_does_not_pass_for_a_pretrained_one(tmp_path):
+    folder = tmp_path / "policy"
+    model.save_policy(model.load_policy(CONFIG, STATS), folder)
+    tensors = load_file(folder / "model.safetensors")
+    tensors.pop("model.state_proj.weight")
+    save_file(tensors, folder / "model.safetensors")
+    with pytest.raises(ValueError, match="lacks 1 tensors.*state_proj"):
+        model.load_policy(replace(CONFIG, base=str(folder)))
+
+
+@pytest.mark.unit
+def test_another_kind_of_policy_is_refused(tmp_path):
+    model.save_policy(model.load_policy(CONFIG, STATS), tmp_path / "p")
+    saved = json.loads((tmp_path / "p" / "config.json").read_text())
+    (tmp_path / "p" / "config.json").write_text(json.dumps({"type": "act", "device": saved["device"]}))
+    with pytest.raises(ValueError, match="'act' policy: give a smolvla"):
+        model.load_policy(replace(CONFIG, base=str(tmp_path / "p")), STATS)

@@ -1,0 +1,143 @@
+"""Local training: resume is exact, the seed fixes everything, frozen parts stay frozen, validation is deterministic."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from fedvla_lib import config as configs
+from fedvla_lib import model, train
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
+
+CONFIG = configs.from_profile("tiny", checkpoint_every=2, num_threads=1, train_expert_only=False)
+STATS = {key: {"mean": np.full(6, 10.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
+
+
+class SyntheticBatches:
+    """A learnable stream: the action is the state, plus ten, held over the chunk."""
+
+    seed = 3
+    num_examples = 40
+
+    def at(self, step: int) -> dict:
+        rng = np.random.default_rng([self.seed, step])
+        state = torch.from_numpy(rng.normal(10, 5, (4, 6)).astype(np.float32))
+        images = {
+            image_key(c): torch.from_numpy(rng.random((4, 3, CONFIG.image_size, CONFIG.image_size), np.float32))
+            for c in CAMERAS
+        }
+        padded = torch.zeros(4, CONFIG.chunk_size, dtype=torch.bool)
+        padded[0, -3:] = True
+        action = state[:, None].repeat(1, CONFIG.chunk_size, 1) + 10
+        task = ["Lift the red cube.", "Push the blue cube into the zone."] * 2
+        return {**images, STATE_KEY: state, ACTION_KEY: action, "action_is_pad": padded, "task": task}
+
+
+def weights(bundle):
+    return {name: p.detach().clone() for name, p in bundle.policy.named_parameters()}
+
+
+def same(left, right):
+    return all(torch.equal(left[name], right[name]) for name in left)
+
+
+def run(steps, **kwargs):
+    bundle = model.load_policy(CONFIG, STATS)
+    result = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=steps, progress=False, **kwargs)
+    return bundle, result
+
+
+@pytest.mark.unit
+def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
+    whole, whole_result = run(6, checkpoint_dir=tmp_path / "whole")
+
+    class Dies(SyntheticBatches):
+        def at(self, step):
+            if step == 5:
+                raise KeyboardInterrupt
+            return super().at(step)
+
+    broken = model.load_policy(CONFIG, STATS)
+    with pytest.raises(KeyboardInterrupt):
+        train.local_train(broken, Dies(), CONFIG, steps=6, checkpoint_dir=tmp_path / "cut", progress=False)
+    assert [p.name for p in sorted((tmp_path / "cut").iterdir())] == ["step_000002", "step_000004"]
+    resumed, resumed_result = run(6, checkpoint_dir=tmp_path / "cut", resume=True)
+    assert resumed_result.losses == whole_result.losses
+    assert same(weights(whole), weights(resumed))
+
+
+@pytest.mark.unit
+def test_one_seed_fixes_training_and_leaves_the_callers_random_state_alone():
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first, _ = run(2)
+    assert torch.equal(before, torch.get_rng_state())
+    torch.manual_seed(2)
+    second, _ = run(2)
+    assert same(weights(first), weights(second))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("frozen", [True, False])
+def test_only_what_is_trainable_changes(frozen):
+    config = replace(CONFIG, train_expert_only=frozen, freeze_vision_encoder=True)
+    bundle = model.load_policy(config, STATS)
+    before = weights(bundle)
+    train.local_train(bundle, SyntheticBatches(), config, steps=2, progress=False)
+    changed = {name for name, p in bundle.policy.named_parameters() if not torch.equal(before[name], p)}
+    trainable = {name for name, p in bundle.policy.named_parameters() if p.requires_grad}
+    assert changed <= trainable
+    assert any("lm_expert" in name for name in changed)
+    assert not any("vision_model" in name for name in changed)
+    assert any("text_model" in name for name in changed) is not frozen
+
+
+@pytest.mark.unit
+def test_training_lowers_the_held_out_loss():
+    config = replace(CONFIG, lr=3e-3, warmup_steps=2)
+    bundle = model.load_policy(config, STATS)
+    held_out = [SyntheticBatches().at(10_000 + i) for i in range(4)]
+    before = train.validate(bundle, held_out, tolerance=5.0)
+    train.local_train(bundle, SyntheticBatches(), config, steps=40, progress=False)
+    after = train.validate(bundle, held_out, tolerance=5.0)
+    assert after["loss"] < 0.8 * before["loss"]
+    assert after["action_error"] < before["action_error"]
+
+
+@pytest.mark.unit
+def test_validation_is_deterministic_and_ignores_padded_actions():
+    bundle = model.load_policy(CONFIG, STATS)
+    held_out = [SyntheticBatches().at(0)]
+    first = train.validate(bundle, held_out, tolerance=5.0)
+    held_out[0][ACTION_KEY][0, -3:] = 1e6
+    assert train.validate(bundle, held_out, tolerance=5.0) == first
+    with pytest.raises(ValueError, match="held-out"):
+        train.validate(bundle, [], tolerance=5.0)
+
+
+@pytest.mark.unit
+def test_schedule_continues_where_the_last_round_stopped():
+    bundle = model.load_policy(CONFIG, STATS)
+    config = replace(CONFIG, lr=1e-2, warmup_steps=4)
+    whole, whole_schedule = train._optimizer(bundle, config, 0, 20)
+    rates = []
+    for _ in range(20):
+        rates.append(whole.param_groups[0]["lr"])
+        whole.step()
+        whole_schedule.step()
+    later, later_schedule = train._optimizer(bundle, config, 7, 20)
+    for expected in rates[7:]:
+        assert later.param_groups[0]["lr"] == pytest.approx(expected)
+        later.step()
+        later_schedule.step()
+
+
+@pytest.mark.unit
+def test_a_diverging_loss_stops_with_a_clear_line():
+    class Poison(SyntheticBatches):
+        def at(self, step):
+            return {**super().at(step), STATE_KEY: torch.full((4, 6), float("nan"))}
+
+    with pytest.raises(FloatingPointError, match="step 0: lower lr"):
+        train.local_train(model.load_policy(CONFIG, STATS), Poison(), CONFIG, steps=1, progress=False)
