@@ -20,29 +20,33 @@ class Config:
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
     image_size: int = 96  # side of the square camera images in pixels
     val_fraction: float = 0.1  # share of episodes held out for validation, per task
-    augment: bool = True  # random shift and brightness of training images
+    augment: bool = False  # jitter training images; off, a frozen model's view of a frame is computed once and kept
     # federation
     num_clients: int = 10  # clients the episodes are partitioned over
     partition: str = "modulo"  # modulo, task or dirichlet
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
-    num_server_rounds: int = 4  # rounds of federated averaging
+    num_server_rounds: int = 10  # rounds of federated averaging
     fraction_train: float = 1.0  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
     # model
-    base: str = "nano"  # 'nano' (random weights), a local pretrained_model folder, or a hub id
+    base: str = "nano-warm"  # 'nano' (random weights), 'nano-warm' (has learned lift), a local folder or a hub id
     chunk_size: int = 16  # future actions predicted at once; 50 in smolvla_base
     n_action_steps: int = 8  # actions of a chunk carried out before the model looks again
     freeze_vision_encoder: bool = True  # keep the vision encoder fixed
     train_expert_only: bool = True  # keep the whole vision-language model fixed, train expert and projections
+    train_state_proj: bool = False  # also train the projection of the arm's state into the prefix
+    warm_steps: int = 600  # 'nano-warm': optimiser steps of its training from random weights
+    warm_episodes: int = 60  # 'nano-warm': demonstrations of lift that the server records for it
+    warm_lr: float = 1e-3  # 'nano-warm': peak learning rate
     # local training
-    local_steps: int = 20  # optimiser steps of a client in a round
+    local_steps: int = 30  # optimiser steps of a client in a round
     batch_size: int = 32  # samples per optimiser step
     lr: float = 1e-3  # peak learning rate of AdamW; smolvla_base uses 1e-4
     warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
     checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
     # evaluation
-    eval_every: int = 2  # rounds between closed-loop evaluations; 0 evaluates after the last round only
+    eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 5  # rollouts per task of the global model at each evaluation
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
     action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
@@ -62,6 +66,8 @@ PROFILES: dict[str, dict[str, Any]] = {
         "local_steps": 2,
         "batch_size": 4,
         "warmup_steps": 1,
+        "warm_steps": 2,
+        "warm_episodes": 2,
         "eval_every": 0,
         "eval_rollouts": 1,
         "checkpoint_every": 2,
@@ -69,6 +75,8 @@ PROFILES: dict[str, dict[str, Any]] = {
     "laptop": {},
     "gpu": {
         "base": "lerobot/smolvla_base",
+        "train_state_proj": True,
+        "augment": True,
         "image_size": 224,
         "chunk_size": 50,
         "n_action_steps": 50,
@@ -130,7 +138,8 @@ def check(config: Config) -> Config:
     """Return `config` if every value is usable, else raise ValueError naming the setting, the value and the range."""
     positive = (
         "episodes_per_task", "image_size", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
-        "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
+        "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg", "warm_steps",
+        "warm_episodes", "warm_lr",
     )  # fmt: skip
     for name in positive:
         _require(getattr(config, name) > 0, config, name, "a number above 0")

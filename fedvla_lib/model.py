@@ -208,6 +208,7 @@ def _adapt(settings: SmolVLAConfig, config: Config) -> None:
     settings.n_action_steps = config.n_action_steps
     settings.freeze_vision_encoder = config.freeze_vision_encoder
     settings.train_expert_only = config.train_expert_only
+    settings.train_state_proj = config.train_state_proj
     settings.device = config.device
 
 

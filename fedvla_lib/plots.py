@@ -128,3 +128,379 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 def _new_axes() -> Axes:
     _, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
     return ax
+
+
+def module_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw parameters per part of a model, trainable and frozen; columns part, parameters, trainable."""
+    if ax is None:
+        _, ax = plt.subplots(figsize=(8, 0.38 * len(table) + 1.1), layout="constrained")
+    millions, trainable = table.parameters / 1e6, table.trainable / 1e6
+    ax.barh(table.part, trainable, color=PALETTE[0], label="trainable")
+    ax.barh(table.part, millions - trainable, left=trainable, color="#BBBBBB", label="frozen")
+    for place, count in enumerate(table.parameters):
+        ax.annotate(f"{count:,}", (millions.iloc[place], place), xytext=(4, 0), textcoords="offset points", va="center")
+    ax.set_xlim(0, 1.2 * millions.max())
+    ax.invert_yaxis()
+    ax.set_xlabel("parameters [millions]")
+    ax.set_ylabel("part of the model")
+    ax.legend(frameon=False, loc="lower right")
+    return ax
+
+
+def trainable_bars(tables: dict[str, pd.DataFrame], *, ax: Axes | None = None) -> Axes:
+    """Draw how many parameters train under each setting, split into parts (columns as `module_bars`)."""
+    if ax is None:
+        _, ax = plt.subplots(figsize=(8, 0.5 * len(tables) + 1.9), layout="constrained")
+    counts = pd.DataFrame({name: table.set_index("part").trainable for name, table in tables.items()}) / 1e6
+    left = np.zeros(len(tables))
+    for i, part in enumerate(counts.index[counts.sum(axis=1) > 0]):
+        ax.barh(counts.columns, counts.loc[part], left=left, label=part, color=PALETTE[i % len(PALETTE)])
+        left += counts.loc[part].to_numpy()
+    ax.invert_yaxis()
+    ax.set_xlabel("trainable parameters [millions]")
+    ax.set_ylabel("setting")
+    ax.legend(frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.4, -0.3))
+    return ax
+
+
+def flow(
+    points: np.ndarray, times: Sequence[float], *, ylabel: str, goal: np.ndarray | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw one joint of an action chunk on its way from noise to plan: `points` (times, chunk), a line per flow time."""
+    ax = ax or _new_axes()
+    steps = np.arange(1, points.shape[1] + 1)
+    shades = plt.get_cmap("viridis")(np.asarray(times) * 0.9)
+    for time, line, shade in zip(times, points, shades, strict=True):
+        ax.plot(steps, line, ".-", color=shade, linewidth=1, label=f"t = {time:.2f}")
+    if goal is not None:
+        ax.plot(steps, goal, "k--", label="demonstration")
+    ax.set_xlabel("step of the chunk")
+    ax.set_ylabel(ylabel)
+    return ax
+
+
+def padding(masks: np.ndarray, *, ax: Axes | None = None) -> Axes:
+    """Draw which steps of action chunks are padding: `masks` bool (samples, chunk)."""
+    ax = ax or _new_axes()
+    colors = plt.matplotlib.colors.ListedColormap([PALETTE[0], "#DDDDDD"])
+    ax.imshow(masks, cmap=colors, vmin=0, vmax=1, aspect="auto", extent=(0.5, masks.shape[1] + 0.5, len(masks), 0))
+    for value, name in enumerate(("real action: counts in the loss", "padding: left out")):
+        ax.plot([], [], "s", color=colors(value), label=name)
+    ax.grid(False)
+    ax.set_xlabel("step of the chunk")
+    ax.set_ylabel("frames before the end of the episode")
+    ax.set_yticks(np.arange(len(masks)) + 0.5, np.arange(len(masks), 0, -1), fontsize=7)
+    ax.legend(frameon=False, ncols=2, loc="upper center", bbox_to_anchor=(0.5, 1.15))
+    return ax
+
+
+def learning_rate(rates: Sequence[float], *, ax: Axes | None = None) -> Axes:
+    """Draw the learning rate of each optimiser step."""
+    ax = ax or _new_axes()
+    ax.plot(np.arange(1, len(rates) + 1), rates, "-" if len(rates) > 20 else "o-")
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("optimiser step")
+    ax.set_ylabel("learning rate of AdamW")
+    return ax
+
+
+def error_by_joint(errors: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw the action error of each joint as grouped bars: rows are joints, columns are models."""
+    ax = ax or _new_axes()
+    width = 0.8 / errors.shape[1]
+    for i, name in enumerate(errors.columns):
+        place = np.arange(len(errors)) + (i - (errors.shape[1] - 1) / 2) * width
+        ax.bar(place, errors[name], width * 0.9, label=name)
+    units = dict(zip(JOINT_NAMES, JOINT_UNITS, strict=True))
+    ax.set_xticks(range(len(errors)), [f"{j.removesuffix('.pos')}\n[{units[j]}]" for j in errors.index], fontsize=8)
+    ax.set_xlabel("joint")
+    ax.set_ylabel("mean absolute action error")
+    ax.legend(frameon=False)
+    return ax
+
+
+def loss_and_success(table: pd.DataFrame, x: str, *, xlabel: str, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw held-out loss above success rate over `x`; columns loss, success_rate, low, high (NaN: not measured)."""
+    if axes is None:
+        _, axes = plt.subplots(2, 1, figsize=(7, 4.8), sharex=True, layout="constrained")
+    axes[0].plot(table[x], table.loss, "o-", color=PALETTE[1])
+    axes[0].set_ylabel("held-out loss\n[normalised units²]")
+    axes[0].set_ylim(bottom=0)
+    seen = table.dropna(subset=["success_rate"])
+    errors = np.abs(np.stack([seen.success_rate - seen.low, seen.high - seen.success_rate]))
+    axes[1].errorbar(seen[x], seen.success_rate, yerr=errors, fmt="o-", capsize=3, color=PALETTE[0])
+    axes[1].set_ylim(-0.02, 1.02)
+    axes[1].set_ylabel("success rate\n(95 % Wilson interval)")
+    axes[1].set_xlabel(xlabel)
+    for ax in axes:
+        ax.set_xticks(sorted(set(table[x])))
+    return axes
+
+
+def rollout_grid(rows: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw who succeeded when: a square per client and round with its task; columns who, round, task, success."""
+    who, rounds = list(dict.fromkeys(rows.who)), sorted(rows["round"].unique())
+    if ax is None:
+        _, ax = plt.subplots(figsize=(2.6 + 1.3 * len(rounds), 0.42 * len(who) + 1.2), layout="constrained")
+    for (name, number), group in rows.groupby(["who", "round"]):
+        x, y, share = rounds.index(number), who.index(name), group.success.mean()
+        color = PALETTE[2] if share == 1 else PALETTE[1] if share == 0 else PALETTE[4]
+        ax.add_patch(plt.Rectangle((x - 0.45, y - 0.4), 0.9, 0.8, color=color, alpha=0.35))
+        text = f"{', '.join(dict.fromkeys(group.task))}\n{int(group.success.sum())}/{len(group)}"
+        ax.text(x, y, text, ha="center", va="center", fontsize=8)
+    ax.set_xlim(-0.6, len(rounds) - 0.4)
+    ax.set_ylim(len(who) - 0.4, -0.6)
+    ax.set_xticks(range(len(rounds)), rounds)
+    ax.set_yticks(range(len(who)), who)
+    ax.grid(False)
+    ax.set_xlabel("round")
+    ax.set_ylabel("where the rollouts ran")
+    return ax
+
+
+def interval_width(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw the width of an interval against the number of rollouts; columns n, width, success_rate (one line each)."""
+    ax = ax or _new_axes()
+    for rate, part in table.groupby("success_rate"):
+        ax.plot(part.n, 100 * part.width, "o-", label=f"{rate:.0%} succeed")
+    ax.set_xscale("log")
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("number of rollouts (logarithmic)")
+    ax.set_ylabel("width of the 95 % interval [points]")
+    ax.legend(frameon=False)
+    return ax
+
+
+def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw how often a difference is detected against the rollouts per model; columns n, power, difference."""
+    ax = ax or _new_axes()
+    for difference, part in table.groupby("difference"):
+        ax.plot(part.n, part.power, "o-", label=f"true difference {100 * difference:.0f} points")
+    ax.axhline(0.8, color="#555555", linestyle=":", linewidth=1)
+    ax.set_xscale("log")
+    ax.set_ylim(0, 1.02)
+    ax.set_xlabel("rollouts per model (logarithmic)")
+    ax.set_ylabel("share of experiments that see it")
+    ax.legend(frameon=False)
+    return ax
+
+
+def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw measured joint positions (T, 6) of several actors against time: one panel per joint."""
+    if axes is None:
+        _, grid = plt.subplots(2, 3, figsize=(10, 4.6), sharex=True, layout="constrained")
+        axes = grid.ravel()
+    for i, ax in enumerate(axes):
+        for name, states in by_name.items():
+            ax.plot(np.arange(len(states)) / FPS, states[:, i], label=name)
+        ax.set_title(JOINT_NAMES[i], fontsize=10)
+        ax.set_ylabel(f"position [{JOINT_UNITS[i]}]")
+    for ax in axes[-3:]:
+        ax.set_xlabel("time [s]")
+    axes[0].legend(frameon=False, fontsize=8)
+    return axes
+
+
+def film_strips(images: dict[str, np.ndarray], *, count: int = 6, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw each camera's film strip, camera -> (T, H, W, 3), one under the other."""
+    if axes is None:
+        _, grid = plt.subplots(len(images), 1, figsize=(10, 2.1 * len(images)), layout="constrained", squeeze=False)
+        axes = grid.ravel()
+    for ax, (camera, frames) in zip(axes, images.items(), strict=True):
+        film_strip(frames, count=count, title=f"camera: {camera}", ax=ax)
+    for ax in axes[:-1]:
+        ax.set_xlabel("")
+    return axes
+
+
+def pictures(rows: dict[str, np.ndarray], *, titles: Sequence[str] = (), axes: np.ndarray | None = None) -> np.ndarray:
+    """Draw a table of pictures: each entry of `rows` is one row of them, (n, H, W, 3); `titles` name the columns."""
+    count = len(next(iter(rows.values())))
+    if axes is None:
+        size = (10, 10 / count * len(rows) + 0.4)
+        _, axes = plt.subplots(len(rows), count, figsize=size, layout="constrained", squeeze=False)
+    for line, (name, frames) in zip(axes, rows.items(), strict=True):
+        line[0].set_ylabel(name)
+        for ax, frame in zip(line, frames, strict=True):
+            ax.imshow(frame)
+            ax.set_xticks([])
+            ax.set_yticks([])
+    for ax, title in zip(axes[0], titles, strict=False):
+        ax.set_title(title, fontsize=8)
+    return axes
+
+
+def chunk(
+    actions: np.ndarray, frame: int, future: np.ndarray, is_pad: np.ndarray, *, joint: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Draw one joint of an episode's actions (T, 6) and the chunk `future` (C, 6) that starts at `frame`."""
+    ax = ax or _new_axes()
+    seconds = (frame + np.arange(len(future))) / FPS
+    ax.plot(np.arange(len(actions)) / FPS, actions[:, joint], color="#999999", label="action, whole episode")
+    ax.plot(seconds[~is_pad], future[~is_pad, joint], "o", color=PALETTE[0], label="chunk")
+    ax.plot(seconds[is_pad], future[is_pad, joint], "x", color=PALETTE[1], label="chunk, padding")
+    ax.axvline(frame / FPS, color="black", linestyle=":", label="observation")
+    ax.set_xlabel("time in the episode [s]")
+    ax.set_ylabel(f"{JOINT_NAMES[joint]} [{JOINT_UNITS[joint]}]")
+    ax.legend(frameon=False)
+    return ax
+
+
+def likeness(gaps_s: np.ndarray, distances: np.ndarray, elsewhere: float, *, ax: Axes | None = None) -> Axes:
+    """Draw how far apart two frames of an episode are against the time between them; `elsewhere`: another episode's."""
+    ax = ax or _new_axes()
+    ax.plot(gaps_s, distances, "o-", label="same episode")
+    ax.axhline(elsewhere, color=PALETTE[1], linestyle="--", label="another episode, same task and moment")
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("time between the two frames [s]")
+    ax.set_ylabel("mean difference [grey levels of 255]")
+    ax.legend(frameon=False)
+    return ax
+
+
+def client_counts_grid(counts: dict[str, pd.DataFrame], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw `client_counts` of several partitions side by side, on one scale; the keys become titles."""
+    if axes is None:
+        _, axes = plt.subplots(1, len(counts), figsize=(10, 3.4), sharey=True, layout="constrained")
+    for ax, (name, table) in zip(axes, counts.items(), strict=True):
+        client_counts(table, ax=ax)
+        ax.set_title(name, fontsize=10)
+        ax.get_legend().remove()
+    for ax in axes[1:]:
+        ax.set_ylabel("")
+    axes[0].legend(frameon=False, title="task")
+    return axes
+
+
+def heterogeneity(table: pd.DataFrame, *, bounds: dict[str, float] | None = None, ax: Axes | None = None) -> Axes:
+    """Draw columns `total_variation` against `alpha`, one dot a draw, with mean and range; `bounds`: named levels."""
+    ax = ax or _new_axes()
+    groups = table.groupby("alpha").total_variation
+    ax.fill_between(groups.mean().index, groups.min(), groups.max(), alpha=0.15)
+    ax.plot(table.alpha, table.total_variation, "o", color=PALETTE[0], alpha=0.4, markersize=4, label="one draw")
+    ax.plot(groups.mean().index, groups.mean(), color=PALETTE[0], label="mean; band: lowest to highest draw")
+    for (name, level), style in zip((bounds or {}).items(), ("--", ":", "-."), strict=False):
+        ax.axhline(level, color="#555555", linestyle=style, label=name)
+    ax.set_xscale("log")
+    ax.set_ylim(bottom=-0.02)
+    ax.set_xlabel("Dirichlet concentration alpha (log scale)")
+    ax.set_ylabel("total variation distance")
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def client_statistics(
+    means: np.ndarray,
+    stds: np.ndarray,
+    pooled_mean: np.ndarray,
+    pooled_std: np.ndarray,
+    *,
+    axes: Sequence[Axes] | None = None,
+) -> Sequence[Axes]:
+    """Draw each client's mean and standard deviation per joint, both (clients, 6), over the pooled ones, (6,)."""
+    if axes is None:
+        _, grid = plt.subplots(2, 3, figsize=(10, 4.8), sharex=True, layout="constrained")
+        axes = grid.ravel()
+    places = np.arange(len(means))
+    for i, ax in enumerate(axes):
+        low, high = pooled_mean[i] - pooled_std[i], pooled_mean[i] + pooled_std[i]
+        ax.axhspan(low, high, color=PALETTE[1], alpha=0.12, label="pooled mean ± std")
+        ax.axhline(pooled_mean[i], color=PALETTE[1])
+        ax.errorbar(places, means[:, i], stds[:, i], fmt="o", capsize=2, markersize=4, label="client mean ± std")
+        ax.set_title(JOINT_NAMES[i], fontsize=10)
+        ax.set_ylabel(f"action [{JOINT_UNITS[i]}]")
+        ax.set_xticks(places)
+    for ax in axes[-3:]:
+        ax.set_xlabel("client")
+    axes[0].legend(frameon=False, fontsize=8)
+    return axes
+
+
+def client_weights(weights: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw each client's share of the average, in percent: rows are clients, columns are ways to weight."""
+    ax = ax or _new_axes()
+    width = 0.8 / len(weights.columns)
+    for i, name in enumerate(weights.columns):
+        places = np.arange(len(weights)) + (i - (len(weights.columns) - 1) / 2) * width
+        ax.bar(places, 100 * weights[name], width * 0.9, label=name)
+    ax.set_xticks(range(len(weights)), weights.index.astype(str))
+    ax.set_xlabel("client")
+    ax.set_ylabel("weight in the average [%]")
+    ax.legend(frameon=False)
+    return ax
+
+
+def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
+    """Draw a table as bars: a group per row, a colour per column; an arm keeps its colour."""
+    ax = ax or _new_axes()
+    width = 0.8 / table.shape[1]
+    for i, name in enumerate(table.columns):
+        place = np.arange(len(table)) + (i - (table.shape[1] - 1) / 2) * width
+        ax.bar(place, table[name], width * 0.9, label=name, color=ARM_COLORS.get(name, PALETTE[i % len(PALETTE)]))
+    ax.set_xticks(range(len(table)), table.index.astype(str))
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    if table.shape[1] > 1:
+        ax.legend(frameon=False, ncols=min(4, table.shape[1]), loc="upper center", bbox_to_anchor=(0.5, 1.16))
+    return ax
+
+
+def clients_by_round(table: pd.DataFrame, value: str, *, ylabel: str, ax: Axes | None = None) -> Axes:
+    """Draw a metric of every client by round, and their mean weighted by frames; columns round, who, num_examples."""
+    ax = ax or _new_axes()
+    for number, (_, part) in enumerate(table.groupby("who", sort=False)):
+        ax.plot(part["round"], part[value], ".-", color="#AAAAAA", linewidth=1, label="" if number else "one client")
+    weighted = (table[value] * table.num_examples).groupby(table["round"]).sum()
+    mean = weighted / table.groupby("round").num_examples.sum()
+    ax.plot(mean.index, mean, "o-", color=PALETTE[0], linewidth=2, label="mean weighted by frames")
+    ax.set_xticks(sorted(set(table["round"])))
+    ax.set_xlabel("round")
+    ax.set_ylabel(ylabel)
+    ax.legend(frameon=False)
+    return ax
+
+
+def cosine_map(cosines: np.ndarray, *, title: str = "", ax: Axes | None = None) -> Axes:
+    """Draw cosines between the updates of clients, (clients, clients) in [-1, 1], as coloured squares with numbers."""
+    ax = ax or _new_axes()
+    picture = ax.imshow(cosines, cmap="RdBu", vmin=-1, vmax=1)
+    for (i, j), cosine in np.ndenumerate(cosines):
+        shade = "white" if abs(cosine) > 0.6 else "black"
+        ax.text(j, i, f"{cosine:.2f}", ha="center", va="center", fontsize=7, color=shade)
+    ax.set_xticks(range(len(cosines)))
+    ax.set_yticks(range(len(cosines)))
+    ax.grid(False)
+    ax.set_xlabel("client")
+    ax.set_ylabel("client")
+    ax.set_title(title, fontsize=10)
+    ax.figure.colorbar(picture, ax=ax, label="cosine", shrink=0.8)
+    return ax
+
+
+def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw one point an arm: held-out loss across, success rate up; columns arm, loss, success_rate, low, high."""
+    ax = ax or _new_axes()
+    for i, point in enumerate(table.itertuples()):
+        color = ARM_COLORS.get(point.arm, PALETTE[i % len(PALETTE)])
+        error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
+        ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.arm)
+    ax.set_xlim(left=0)
+    ax.set_ylim(-0.02, 1.02)
+    ax.set_xlabel("held-out loss [normalised units²]")
+    ax.set_ylabel("success rate (95 % Wilson interval)")
+    ax.legend(frameon=False)
+    return ax
+
+
+def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw differences in success rate with their intervals, a line each; columns arm, other, difference, low, high."""
+    ax = ax or _new_axes()
+    places = np.arange(len(table))
+    errors = np.abs(np.stack([table.difference - table.low, table.high - table.difference]))
+    ax.errorbar(100 * table.difference, places, xerr=100 * errors, fmt="o", capsize=4, color=PALETTE[0])
+    ax.axvline(0, color="#555555", linewidth=1)
+    ax.set_yticks(places, table.arm + " − " + table.other)
+    ax.set_ylim(len(table) - 0.5, -0.5)
+    ax.set_xlabel("difference in success rate [points], 95 % bootstrap interval")
+    ax.set_ylabel("pair of arms")
+    return ax

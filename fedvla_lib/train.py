@@ -24,6 +24,7 @@ from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, granted_threads
 from fedvla_lib.model import Bundle, predict_chunk
+from fedvla_lib.prefix import PREFIX_KEY, prefix_loss
 from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES
 
 WEIGHTS_FILE = "trainable.safetensors"
@@ -134,13 +135,23 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
 
 
 def _step(bundle: Bundle, batch: dict[str, Any], optimizer: torch.optim.Optimizer, scheduler: Any) -> float:
-    loss, _ = bundle.policy.forward(bundle.preprocess(batch))
+    loss = _loss(bundle, batch)
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(_trainable(bundle), bundle.policy.config.optimizer_grad_clip_norm)
     optimizer.step()
     scheduler.step()
     return loss.item()
+
+
+def _loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
+    """The policy's own loss, or the same from a stored prefix; noise and time are drawn alike in both."""
+    if PREFIX_KEY not in batch:
+        return bundle.policy.forward(bundle.preprocess(batch))[0]
+    model, settings = bundle.policy.model, bundle.policy.config
+    shape = (len(batch["task"]), settings.chunk_size, settings.max_action_dim)
+    noise = model.sample_noise(shape, settings.device)
+    return prefix_loss(bundle, batch, noise, model.sample_time(shape[0], settings.device))
 
 
 def _trainable(bundle: Bundle) -> list[torch.nn.Parameter]:
@@ -164,6 +175,12 @@ def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int
     for group in optimizer.param_groups:
         group["lr"] = config.lr * scheduler.lr_lambdas[0](start_step)
     return optimizer, scheduler
+
+
+def learning_rates(bundle: Bundle, config: Config, *, steps: int) -> list[float]:
+    """Return the learning rate of each step of a training of `steps` steps."""
+    _, scheduler = _optimizer(bundle, config, 0, steps)
+    return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
 
 
 @contextmanager

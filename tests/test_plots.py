@@ -71,3 +71,87 @@ def test_curves_are_labelled_and_show_what_they_are_given():
     ax = plots.by_round(table, "success_rate", ylabel="success rate")
     np.testing.assert_allclose(ax.lines[0].get_ydata(), [0.0, 0.5])
     assert labelled(ax) and len(ax.collections) == 1
+
+
+def test_film_strips_show_every_camera():
+    frames = np.random.default_rng(0).integers(0, 255, (12, 8, 8, 3), np.uint8)
+    axes = plots.film_strips({"overhead": frames, "front": frames[::-1]}, count=3)
+    assert [ax.get_title() for ax in axes] == ["camera: overhead", "camera: front"]
+    np.testing.assert_array_equal(axes[1].images[0].get_array()[:, :8], frames[-1])
+
+
+def test_pictures_put_each_frame_in_its_place():
+    frames = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), np.uint8)
+    axes = plots.pictures({"as it is": frames, "reversed": frames[::-1]}, titles=["a", "b", "c"])
+    assert axes.shape == (2, 3) and axes[0, 2].get_title() == "c" and axes[1, 0].get_ylabel() == "reversed"
+    np.testing.assert_array_equal(axes[1, 0].images[0].get_array(), frames[2])
+
+
+def test_chunk_separates_real_actions_from_padding():
+    actions = np.random.default_rng(0).normal(size=(10, 6))
+    future, is_pad = actions[[8, 9, 9]], np.array([False, False, True])
+    ax = plots.chunk(actions, 8, future, is_pad, joint=2)
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), actions[[8, 9], 2])
+    np.testing.assert_allclose(ax.lines[2].get_xdata(), [1.0])
+    assert labelled(ax)
+
+
+def test_likeness_shows_distances_and_the_level_of_another_episode():
+    ax = plots.likeness(np.array([0.1, 0.2]), np.array([1.0, 2.0]), 5.0)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [1.0, 2.0])
+    assert set(ax.lines[1].get_ydata()) == {5.0} and labelled(ax)
+
+
+def test_partitions_and_their_heterogeneity_show_what_they_are_given():
+    counts = pd.DataFrame({"lift": [3, 0], "push": [1, 4]}, index=[0, 1])
+    axes = plots.client_counts_grid({"even": counts, "odd": counts})
+    assert [ax.get_title() for ax in axes] == ["even", "odd"] and axes[0].get_legend() is not None
+    table = pd.DataFrame({"alpha": [0.1, 0.1, 1.0, 1.0], "total_variation": [0.6, 0.4, 0.2, 0.4]})
+    ax = plots.heterogeneity(table, bounds={"one task a client": 2 / 3})
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), [0.5, 0.3])
+    assert labelled(ax) and ax.get_xscale() == "log"
+
+
+def test_client_statistics_and_weights_show_every_client():
+    means = np.arange(12.0).reshape(2, 6)
+    axes = plots.client_statistics(means, np.ones((2, 6)), means.mean(axis=0), np.ones(6))
+    assert len(axes) == 6
+    np.testing.assert_allclose(axes[3].containers[0].lines[0].get_ydata(), means[:, 3])
+    weights = pd.DataFrame({"by frames": [0.25, 0.75], "equal": [0.5, 0.5]})
+    ax = plots.client_weights(weights)
+    assert [bar.get_height() for bar in ax.patches] == [25, 75, 50, 50] and labelled(ax)
+
+
+def test_grouped_bars_give_every_number_a_bar_and_an_arm_its_colour():
+    table = pd.DataFrame({"federated": [1.0, 2.0], "other": [3.0, 4.0]}, index=["lift", "push"])
+    ax = plots.grouped_bars(table, xlabel="task", ylabel="loss")
+    assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 4] and labelled(ax)
+    assert matplotlib.colors.to_hex(ax.patches[0].get_facecolor()) == plots.ARM_COLORS["federated"].lower()
+
+
+def test_clients_by_round_weights_the_mean_by_frames():
+    table = pd.DataFrame(
+        {"round": [1, 1, 2, 2], "who": ["a", "b"] * 2, "loss": [1.0, 5.0, 2.0, 2.0], "num_examples": [3, 1] * 2}
+    )
+    ax = plots.clients_by_round(table, "loss", ylabel="loss")
+    np.testing.assert_allclose(ax.lines[-1].get_ydata(), [2.0, 2.0])
+    assert len(ax.lines) == 3 and labelled(ax)
+
+
+def test_cosine_map_writes_every_cosine():
+    ax = plots.cosine_map(np.array([[1.0, -0.25], [-0.25, 1.0]]))
+    assert [text.get_text() for text in ax.texts] == ["1.00", "-0.25", "-0.25", "1.00"] and labelled(ax)
+
+
+def test_arms_and_their_differences_keep_their_intervals():
+    arms = pd.DataFrame({"arm": ["base"], "loss": [0.5], "success_rate": [0.2], "low": [0.1], "high": [0.4]})
+    ax = plots.loss_against_success(arms)
+    np.testing.assert_allclose(ax.containers[0].lines[0].get_xydata(), [[0.5, 0.2]])
+    assert labelled(ax)
+    pairs = pd.DataFrame(
+        {"arm": ["federated"], "other": ["base"], "difference": [0.3], "low": [0.1], "high": [0.5]}
+    )
+    ax = plots.paired_differences(pairs)
+    segment = ax.containers[0].lines[2][0].get_segments()[0]
+    np.testing.assert_allclose(segment[:, 0], [10, 50])
+    assert labelled(ax) and ax.get_yticklabels()[0].get_text() == "federated − base"

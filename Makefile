@@ -1,0 +1,104 @@
+# make book   build the book: environment, data, every chapter, HTML      make doctor  what is missing on this machine
+# make test   run everything that guards it                               make lab     open the notebooks
+# make data   record the demonstrations only                              make lock    pin the dependencies anew
+# make clean  remove the built book and the test reports (environment, recordings and run folders stay)
+#
+# Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
+# Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
+# torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv).
+.DEFAULT_GOAL := help
+.PHONY: help env book data doctor test lint lab lock clean
+.DELETE_ON_ERROR:
+
+PYTHON ?= python3
+BIN := .venv/bin
+UV := .uv/bin/uv
+LOCK := requirements.lock
+TORCH_BACKEND ?= $(shell cat .venv/.torch-backend 2>/dev/null)
+STAMP := .venv/.installed$(if $(TORCH_BACKEND),-$(TORCH_BACKEND))
+TORCH := ^(torch|torchvision|triton|nvidia-[^=]*|cuda-[^=]*)==
+
+export FEDVLA_PROFILE ?= laptop
+export FEDVLA_CACHE ?= $(CURDIR)/.cache/fedvla
+export UV_PYTHON_INSTALL_DIR := $(CURDIR)/.uv/python
+# Full size loads smolvla_base from the hub; below that a chapter that reaches for the network is a mistake.
+export HF_HUB_OFFLINE ?= $(if $(filter gpu,$(FEDVLA_PROFILE)),0,1)
+export HF_HOME ?= $(CURDIR)/.cache/huggingface
+export HF_HUB_DISABLE_TELEMETRY := 1
+export FLWR_HOME ?= $(CURDIR)/.cache/flwr
+export FLWR_TELEMETRY_ENABLED := 0
+export FLWR_DISABLE_UPDATE_CHECK := 1
+export FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION := 1
+export RAY_USAGE_STATS_ENABLED := 0
+export TOKENIZERS_PARALLELISM := false
+export PYTHONHASHSEED := 0
+export IPYTHONDIR := $(CURDIR)/.cache/ipython
+export JUPYTER_CONFIG_DIR := $(CURDIR)/.cache/jupyter/config
+export JUPYTER_DATA_DIR := $(CURDIR)/.cache/jupyter/data
+export JUPYTER_RUNTIME_DIR := $(CURDIR)/.cache/jupyter/runtime
+export JUPYTER_PREFER_ENV_PATH := 1
+export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
+ifeq ($(shell uname -s),Linux)
+export MUJOCO_GL ?= egl
+endif
+
+help:
+	@sed -n '1,8s/^# \{0,1\}//p' Makefile
+
+env: $(STAMP)
+
+$(UV): requirements-uv.lock
+	@$(PYTHON) -m venv --clear .uv || { echo "no virtual environment: apt-get install python3-venv, or PYTHON=<another Python from 3.9 up> make ..." >&2; exit 1; }
+	.uv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements-uv.lock
+	@touch $@
+
+# The lock goes in as it stands, hashes checked. With TORCH_BACKEND a new environment gets torch first, from the wheels uv
+# chooses for that backend; they are other files with other hashes, so the rest of the lock follows without torch and its
+# CUDA libraries. The choice is remembered until .venv is removed.
+$(STAMP): $(LOCK) pyproject.toml $(UV)
+	@$(if $(TORCH_BACKEND),rm -rf .venv,rm -f .venv/.installed*)
+	@test -x $(BIN)/python || $(UV) venv --quiet --python 3.12 .venv || $(UV) venv --python '>=3.12,<3.14' .venv
+ifeq ($(TORCH_BACKEND),)
+	$(UV) pip sync --quiet --require-hashes --python $(BIN)/python $(LOCK)
+else
+	$(UV) pip install --python $(BIN)/python --torch-backend $(TORCH_BACKEND) \
+	  $$(sed -nE 's/^((torch|torchvision)==[^ ;]+).*/\1/p' $(LOCK))
+	awk '/^[a-z0-9]/ {keep = !/$(TORCH)/} keep' $(LOCK) > .venv/without-torch.lock
+	$(UV) pip install --quiet --no-deps --require-hashes --python $(BIN)/python -r .venv/without-torch.lock
+	@echo $(TORCH_BACKEND) > .venv/.torch-backend
+endif
+	$(UV) pip install --quiet --no-deps --no-build-isolation --python $(BIN)/python --editable .
+	@touch $@
+
+doctor: $(STAMP)
+	$(BIN)/fedvla doctor
+
+data: $(STAMP)
+	$(BIN)/fedvla record
+
+book: doctor data
+	$(BIN)/python book/build_book.py --profile $(FEDVLA_PROFILE)
+
+lab: $(STAMP)
+	cd notebooks && ../$(BIN)/jupyter lab
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+
+# Coverage counts the tests alone. The chapters then run twice at the tiny profile: as their reader would run them (nbmake) and
+# with injected parameters (papermill); the second copies are what CI renders.
+test: export FEDVLA_PROFILE := tiny
+test: export HF_HUB_OFFLINE := 1
+test: doctor lint
+	$(BIN)/pytest --cov --cov-report term --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
+	$(BIN)/pytest --nbmake --nbmake-timeout 300 --durations 0 --junitxml _build/tests/junit-notebooks.xml notebooks
+	$(BIN)/python book/build_book.py --profile tiny --execute-only
+
+lock: $(UV)
+	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \
+	  --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade) pyproject.toml -o $(LOCK)
+	echo 'uv==$(shell $(UV) --version | cut -d" " -f2)' | $(UV) pip compile --quiet --universal --python-version 3.12 \
+	  --generate-hashes --no-annotate --custom-compile-command "make lock" - -o requirements-uv.lock
+
+clean:
+	rm -rf _build .pytest_cache .ruff_cache .coverage

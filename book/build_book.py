@@ -1,0 +1,295 @@
+"""Execute the chapters that changed and build the HTML book from the executed copies.
+
+    python book/build_book.py --profile laptop
+
+Jupyter Book's own execution cache looks at a notebook's cells only: after a change of the library it would show old
+results. Here a chapter is executed again exactly when its key changes; the key covers notebook, library, lock and
+profile. papermill executes it with the profile as an injected parameter; the executed copies and the pages go to
+`_build/<profile>/source`, and Jupyter Book builds them from there: execution off, warnings as errors.
+"""
+
+import argparse
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import nbformat
+import papermill
+import yaml
+from papermill.exceptions import PapermillExecutionError
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
+RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
+CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
+
+
+class BookError(ValueError):
+    """The book cannot be built; the message is one line that names the chapter or page."""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One executed notebook: where it is, what it was made from and what it cost."""
+
+    name: str
+    executed: Path
+    key: str
+    seconds: float
+    reused: bool
+
+
+def library_key(root: Path, profile: str) -> str:
+    """Return a digest of everything but the notebook that a chapter's results depend on."""
+    files = sorted((root / "fedvla_lib").rglob("*.py")) + [root / "requirements.lock"]
+    return _digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
+
+
+def notebook_key(notebook: Path, library: str) -> str:
+    """Return the digest that decides whether `notebook` has to be executed again."""
+    return _digest([library.encode(), notebook.name.encode(), notebook.read_bytes()])
+
+
+def _named_bytes(root: Path, path: Path) -> bytes:
+    return path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes()
+
+
+def _digest(parts: Iterable[bytes]) -> str:
+    whole = hashlib.sha256()
+    for part in parts:
+        whole.update(hashlib.sha256(part).digest())  # fixed length each, so that no two lists collide
+    return whole.hexdigest()
+
+
+def toc_pages(root: Path) -> list[str]:
+    """Return the pages of the table of contents, in order and without suffix."""
+    toc = yaml.safe_load((root / "_toc.yml").read_text(encoding="utf-8"))
+    return [toc["root"], *_files_under({key: value for key, value in toc.items() if key != "root"})]
+
+
+def _files_under(node: object) -> list[str]:
+    if isinstance(node, list):
+        return [name for item in node for name in _files_under(item)]
+    if not isinstance(node, dict):
+        return []
+    own = [node["file"]] if "file" in node else []
+    return own + [name for value in node.values() for name in _files_under(value)]
+
+
+def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
+    """Raise BookError unless the parameters cell of `notebook` has every parameter; papermill itself only warns."""
+    known = papermill.inspect_notebook(str(notebook))
+    for name in parameters:
+        if name not in known:
+            raise BookError(f"{notebook.name} has no parameter {name!r}: its parameters cell has {sorted(known)}")
+
+
+def execute_if_changed(notebook: Path, folder: Path, profile: str, library: str) -> Chapter:
+    """Return the executed copy of `notebook` in `folder`, made again only when its key changed.
+
+    Raises:
+        BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
+    """
+    target, key = folder / notebook.name, notebook_key(notebook, library)
+    if target.is_file() and (stamp := _stamp(target)).get("key") == key:
+        return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
+    parameters = {"profile": profile}
+    check_parameters(notebook, parameters)
+    seconds = _execute(notebook, target, parameters)
+    _finish(target, key, profile, seconds)
+    return Chapter(notebook.stem, target, key, seconds, reused=False)
+
+
+def _stamp(executed: Path) -> dict:
+    return nbformat.read(executed, as_version=4).metadata.get("fedvla", {})
+
+
+def _execute(notebook: Path, target: Path, parameters: dict[str, object]) -> float:
+    """Run `notebook` in its own folder, as nbmake and a reader do; return the wall time in seconds."""
+    start = time.monotonic()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        papermill.execute_notebook(
+            str(notebook),
+            str(_unfinished(target)),
+            parameters=parameters,
+            cwd=str(notebook.parent),
+            kernel_name="python3",
+            progress_bar=sys.stderr.isatty(),
+            execution_timeout=CELL_TIMEOUT_S[str(parameters["profile"])],
+            extra_arguments=["--log-level=CRITICAL"],  # kernels talk about their sockets; cells still show errors
+        )
+    except PapermillExecutionError as error:
+        where = os.path.relpath(_unfinished(target))
+        raise BookError(f"{notebook.name}: {error.ename}: {error.evalue.strip()} (see {where})") from error
+    return time.monotonic() - start
+
+
+def _unfinished(target: Path) -> Path:
+    return target.with_name(f"{target.stem}.unfinished.ipynb")
+
+
+def _finish(target: Path, key: str, profile: str, seconds: float) -> None:
+    """Turn papermill's output into the copy that is rendered, without its injected cell and this machine's paths."""
+    notebook = nbformat.read(_unfinished(target), as_version=4)
+    notebook.cells = [cell for cell in notebook.cells if "injected-parameters" not in cell.metadata.get("tags", [])]
+    notebook.metadata.pop("papermill", None)
+    for cell in notebook.cells:
+        cell.metadata.pop("papermill", None)
+    notebook.metadata["fedvla"] = {"key": key, "profile": profile, "seconds": round(seconds, 1)}
+    nbformat.write(notebook, _unfinished(target))
+    os.replace(_unfinished(target), target)
+
+
+def execute_chapters(root: Path, profile: str, only: str = "") -> list[Chapter]:
+    """Execute the chapters of the table of contents whose name contains `only`, in order, saying what each costs."""
+    library = library_key(root, profile)
+    names = [page for page in toc_pages(root) if (root / f"{page}.ipynb").is_file() and only in page]
+    if not names:
+        raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
+    chapters = []
+    for index, name in enumerate(names, start=1):
+        print(f"[{index}/{len(names)}] {name}, profile {profile} ...", flush=True)
+        chapter = execute_if_changed(root / f"{name}.ipynb", root / "_build" / profile / "executed", profile, library)
+        print(f"[{index}/{len(names)}] {name}: {_cost(chapter)}", flush=True)
+        chapters.append(chapter)
+    return chapters
+
+
+def _cost(chapter: Chapter) -> str:
+    return f"unchanged, took {chapter.seconds:.0f} s" if chapter.reused else f"executed in {chapter.seconds:.0f} s"
+
+
+def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> None:
+    """Lay pages, executed chapters and configuration into `source`, touching only what changed.
+
+    Unchanged files keep their time stamp, so that Sphinx reads and writes only the pages that differ.
+    """
+    wanted = {Path("_toc.yml"): (root / "_toc.yml").read_bytes(), Path("_config.yml"): _rendering_config(root)}
+    pages = [path for path in (root / "book").rglob("*") if path.suffix in PAGE_SUFFIXES]
+    wanted |= {path.relative_to(root): path.read_bytes() for path in pages}
+    wanted |= {Path("notebooks") / chapter.executed.name: chapter.executed.read_bytes() for chapter in chapters}
+    if Path(RUN_TIMES) in wanted:
+        wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
+    for path, content in wanted.items():
+        _write_if_changed(source / path, content)
+    for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
+        path.unlink()
+
+
+def _rendering_config(root: Path) -> bytes:
+    """Return the book's configuration with execution off: the chapters it renders are executed already."""
+    config = yaml.safe_load((root / "_config.yml").read_text(encoding="utf-8"))
+    config["execute"] |= {"execute_notebooks": "off"}
+    return yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode()
+
+
+def _write_if_changed(path: Path, content: bytes) -> None:
+    if path.is_file() and path.read_bytes() == content:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + ".unfinished")
+    unfinished.write_bytes(content)
+    os.replace(unfinished, path)
+
+
+def _times_table(chapters: list[Chapter], profile: str) -> str:
+    rows = [f"| [](../notebooks/{chapter.executed.name}) | {chapter.seconds:.0f} |" for chapter in chapters]
+    total = sum(chapter.seconds for chapter in chapters)
+    head = f"\nProfile `{profile}`, {os.cpu_count()} cores.\n\n| chapter | seconds |\n|---|---:|\n"
+    return head + "\n".join([*rows, f"| **together** | **{total:.0f}** |"]) + "\n"
+
+
+def render(source: Path, output: Path) -> Path:
+    """Build the HTML book strictly and return the folder of its pages."""
+    # In a process of its own: Sphinx patches docutils globally and changes sys.path.
+    command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
+    options = ["-W", "-n", "--keep-going", "--quiet"]
+    built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, check=False)  # warnings are on stderr
+    if built.returncode:
+        raise BookError("jupyter-book reported the warnings above; the book is built strictly, so they are errors")
+    return output / "_build" / "html"
+
+
+def check_pages(root: Path, html: Path) -> int:
+    """Return the number of pages, after checking that each page of the contents is there and each image is described.
+
+    Raises:
+        BookError: a page is missing, or an image has no alternative text; the message names them.
+    """
+    pages = toc_pages(root)
+    if missing := [page for page in pages if not (html / f"{page}.html").is_file()]:
+        raise BookError(f"{len(missing)} of {len(pages)} pages were not built: {', '.join(missing)}")
+    bare = {page: count for page in pages if (count := _undescribed_images(html / f"{page}.html"))}
+    if bare:
+        found = ", ".join(f"{page} ({count})" for page, count in bare.items())
+        raise BookError(f"images without alternative text, set it in the cell's metadata mystnb.image.alt: {found}")
+    return len(pages)
+
+
+def _undescribed_images(page: Path) -> int:
+    """Count the images whose alternative text is missing or, as by default, the path of the image."""
+    images = re.findall(r"<img\b[^>]*>", page.read_text(encoding="utf-8"))
+    texts = [re.search(r'\balt="([^"]*)"', image) for image in images]
+    return sum(text is None or not text[1] or "_images/" in text[1] for text in texts)
+
+
+def build(root: Path, profile: str, only: str, execute_only: bool) -> Path | None:
+    """Execute what changed and, unless `execute_only`, build the book; return its front page."""
+    start = time.monotonic()
+    chapters = execute_chapters(root, profile, only)
+    if execute_only:
+        print(f"{len(chapters)} chapters executed at profile {profile}", flush=True)
+        return None
+    work = root / "_build" / profile
+    lay_out(root, work / "source", chapters, profile)
+    count = check_pages(root, render(work / "source", work))
+    published = publish(work / "_build" / "html", root / "_build" / "html" / profile)
+    print(f"{count} pages, {len(chapters)} chapters, profile {profile}, {time.monotonic() - start:.0f} s")
+    return published / "index.html"
+
+
+def publish(html: Path, target: Path) -> Path:
+    """Put the finished pages at `target` in one step: a build that fails leaves the last good book in place."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    fresh, old = target.with_name(target.name + ".new"), target.with_name(target.name + ".old")
+    shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
+    shutil.copytree(html, fresh)
+    if target.exists():
+        os.replace(target, old)
+    os.replace(fresh, target)
+    shutil.rmtree(old, ignore_errors=True)
+    return target
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; bad input and a failing chapter are one line on stderr and exit status 2."""
+    parser = argparse.ArgumentParser(description="Execute the chapters that changed and build the HTML book.")
+    parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
+    parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
+    parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
+    options = parser.parse_args(argv)
+    try:
+        front_page = build(ROOT, options.profile, options.only, options.execute_only or bool(options.only))
+    except (ValueError, OSError) as error:
+        print(f"the book was not built: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted: the chapters executed so far are kept", file=sys.stderr)
+        return 130
+    if front_page:
+        print(f"Open {front_page}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

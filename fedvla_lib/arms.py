@@ -1,0 +1,96 @@
+"""The four ways of training that the book compares, on the same data, from the same start, at equal gradient steps.
+
+``base`` is the start itself; ``local-only`` is one client on its own episodes; ``federated`` is Flower's FedAvg over all
+clients; ``centralized`` pools the clients' training episodes. Results are kept in the cache and found again by settings and
+by the library's own code, so that a change of either trains anew.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
+from fedvla_lib.clients import Client, Share
+from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.train import local_train
+
+
+def steps_per_client(config: Config) -> int:
+    """Gradient steps that one client does in a federated run in which all clients train."""
+    return config.num_server_rounds * config.local_steps
+
+
+def total_steps(config: Config) -> int:
+    """Gradient steps that all clients together do: what the centralized arm may spend."""
+    return config.num_clients * steps_per_client(config)
+
+
+def federated(config: Config, progress: bool = True) -> Path:
+    """Return the folder of a completed federated run with these settings, running it in this process if there is none."""
+    out = cache_dir() / "runs" / _key(config)
+    for folder in sorted(out.glob("*/")):
+        if run_folder.read_stamp(folder)["status"] == "completed":
+            return folder
+    return engine.run_inline(replace(config, out=str(out)), progress=progress)
+
+
+def federated_policy(config: Config) -> model.Bundle:
+    """Return the global model after the last round of the federated run."""
+    last = federated(config) / "global_model" / f"round_{config.num_server_rounds}"
+    return model.load_policy(replace(config, base=str(last)))
+
+
+def base(config: Config) -> model.Bundle:
+    """Return the model every arm starts from, with the normalisation of the pooled training episodes."""
+    return clients.load_policy(config, _pooled_stats(config))
+
+
+def centralized(config: Config, progress: bool = True) -> model.Bundle:
+    """Train on all clients' training episodes for the steps that all clients do together."""
+    whole = _everything(config)
+    return _kept(config, "centralized", lambda: _train(config, whole, total_steps(config), progress))
+
+
+def local_only(config: Config, partition_id: int, progress: bool = True) -> model.Bundle:
+    """Train on one client's episodes alone, for as many steps as it does in the federation.
+
+    The normalisation is the pooled one, as in the federation: what differs is only whose episodes are seen.
+    """
+    client = clients.open_client(config, partition_id)
+    steps = steps_per_client(config)
+    return _kept(config, f"local-only-{partition_id}", lambda: _train(config, client, steps, progress))
+
+
+def _train(config: Config, client: Client, steps: int, progress: bool) -> model.Bundle:
+    bundle = base(config)
+    local_train(bundle, prefix.stored(bundle, client.batches()), config, steps=steps, progress=progress)
+    return bundle
+
+
+def _kept(config: Config, name: str, train: Callable[[], model.Bundle]) -> model.Bundle:
+    """Load the arm's model from the cache, or train and keep it."""
+    folder = cache_dir() / "arms" / f"{name}-{_key(config)}"
+    if not folder.exists():
+        model.save_policy(train(), folder)
+    return model.load_policy(replace(config, base=str(folder)))
+
+
+def _everything(config: Config) -> Client:
+    """One client that holds every training episode."""
+    store = clients.open_frames(config)
+    train_ids, val_ids = data.split(store, config.val_fraction, config.seed)
+    return Client(config, config.num_clients, store, Share(train_ids, val_ids))
+
+
+def _pooled_stats(config: Config) -> str:
+    """The statistics a federation pools, computed from all training episodes at once: they are equal."""
+    return wire.pack_stats(_everything(config).statistics())
+
+
+def _key(config: Config) -> str:
+    """Identify settings and code: a model trained by older code must not pass for a result of this one."""
+    digest = hashlib.sha256(run_folder.config_hash(config).encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]

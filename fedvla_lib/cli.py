@@ -1,0 +1,307 @@
+"""`fedvla ...`: thin shells around the library; each command parses, calls and prints.
+
+Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130.
+Heavy packages are imported inside the commands, so that help and settings answer at once.
+"""
+
+import argparse
+import inspect
+import json
+import re
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+from fedvla_lib.config import PROFILES, Config, from_profile, task_names, to_run_config
+from fedvla_lib.spec import CAMERAS, image_key
+
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    options = build_parser().parse_args(argv)
+    try:
+        return options.handler(options) or 0
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: {options.kept}", file=sys.stderr)
+        return INTERRUPTED
+    except EXPECTED as error:
+        if options.traceback:
+            traceback.print_exc()
+        print(f"fedvla {options.command}: {_one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = _Parser(prog="fedvla", description="Federated training of a vision-language-action model.")
+    parser.add_argument("--traceback", action="store_true", help="show where an error came from")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _command(commands, "doctor", doctor, "check what this machine lacks to run the book")
+    _add_record(commands)
+    _add_experts(commands)
+    _add_settings(_command(commands, "config", config, "print the settings as TOML for flwr run --run-config"))
+    _add_train(commands)
+    _add_run(commands)
+    _add_evaluate(commands)
+    return parser
+
+
+Handler = Callable[[argparse.Namespace], int | None]
+
+
+def _command(commands: Any, name: str, handler: Handler, text: str, kept: str = "nothing was written") -> _Parser:
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser.set_defaults(handler=handler, kept=kept)
+    return parser
+
+
+def _add_record(commands: Any) -> None:
+    kept = "complete episodes are kept, the same command continues"
+    parser = _command(commands, "record", record, "record expert demonstrations as a LeRobot data set", kept)
+    _add_profile(parser)
+    parser.add_argument("--task", action="append", metavar="NAME", help="a task; repeat for several (default: the mix)")
+    parser.add_argument("--episodes", type=int, metavar="N", help="demonstrations of each task")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default: the chapters' cache)")
+    parser.add_argument("--image-size", type=int, metavar="PIXELS", help="side of the camera images")
+    parser.add_argument("--seed", type=int, help="fixes every episode")
+
+
+def _add_experts(commands: Any) -> None:
+    parser = _command(commands, "experts", experts, "measure how often the scripted experts succeed")
+    parser.add_argument("--task", action="append", metavar="NAME", help="a task; repeat for several (default: all)")
+    parser.add_argument("--episodes", type=int, default=200, metavar="N", help="fresh seeds for a task (default: 200)")
+
+
+def _add_train(commands: Any) -> None:
+    kept = "checkpoints are in the run folder; fedvla train --resume FOLDER continues"
+    parser = _command(commands, "train", train, "train on all data in one place, or as one client alone", kept)
+    parser.add_argument("--client", type=int, metavar="K", help="train on the part of client K only")
+    parser.add_argument("--steps", type=int, metavar="N", help="optimiser steps (default: all rounds' local steps)")
+    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="continue this run folder with its own settings")
+    _add_settings(parser)
+
+
+def _add_run(commands: Any) -> None:
+    parser = _command(commands, "run", run, "run a federation", "the rounds that ended stay in the run folder")
+    text = "inline: in this process, in a fixed order; simulation: Flower's runtime, several processes"
+    parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
+    _add_settings(parser)
+
+
+def _add_evaluate(commands: Any) -> None:
+    kept = "the videos written so far stay"
+    parser = _command(commands, "evaluate", evaluate, "let a saved policy act and count its successes", kept)
+    parser.add_argument("policy", type=Path, help="a pretrained_model folder, such as <run>/global_model/round_4")
+    parser.add_argument("--task", action="append", metavar="NAME", help="a task; repeat for several (default: all)")
+    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="attempts at each task (default: 20)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for videos and rows.csv (default: none)")
+    parser.add_argument("--seed", type=int, default=0, help="fixes the noise of the policy (default: 0)")
+
+
+def _add_profile(parser: argparse.ArgumentParser) -> None:
+    text = f"one of {', '.join(PROFILES)} (default: $FEDVLA_PROFILE, else laptop)"
+    parser.add_argument("--profile", metavar="NAME", help=text)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add ``--profile`` and a flag for every setting; only the given ones override the profile."""
+    _add_profile(parser)
+    group = parser.add_argument_group("settings", "every setting of a run; the default is the profile's")
+    meaning = setting_texts()
+    for field in fields(Config):
+        flag, text = "--" + field.name.replace("_", "-"), meaning[field.name].replace("%", "%%")
+        typed = {"type": field.type, "metavar": field.type.__name__.upper()}
+        kind = {"action": argparse.BooleanOptionalAction} if field.type is bool else typed
+        group.add_argument(flag, default=argparse.SUPPRESS, help=text, **kind)
+
+
+def setting_texts() -> dict[str, str]:
+    """Return the sentence that stands behind each field of `Config` in its source."""
+    return dict(re.findall(r"^    (\w+): \w+ = .*?  # (.+)$", inspect.getsource(Config), flags=re.MULTILINE))
+
+
+def settings(options: argparse.Namespace) -> Config:
+    """Return the profile's settings with the given flags on top."""
+    names = {field.name for field in fields(Config)}
+    return from_profile(options.profile, **{name: value for name, value in vars(options).items() if name in names})
+
+
+def doctor(options: argparse.Namespace) -> int:
+    """Print the table of checks; 1 if a chapter could not run."""
+    from fedvla_lib.doctor import can_run, examine, table
+
+    checks = examine()
+    print(table(checks))
+    return 0 if can_run(checks) else 1
+
+
+def record(options: argparse.Namespace) -> None:
+    """Record into a folder, or into the cache where the chapters look."""
+    from fedvla_lib.record import record as record_episodes
+
+    given = {"episodes_per_task": options.episodes, "image_size": options.image_size, "seed": options.seed}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    if options.task:
+        chosen["tasks"] = ",".join(options.task)
+    wanted = from_profile(options.profile, **chosen)
+    if options.out is None:
+        from fedvla_lib.data import resolve
+
+        print(resolve(wanted))
+        return
+    size, seed = wanted.image_size, wanted.seed
+    print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, image_size=size, seed=seed))
+
+
+def experts(options: argparse.Namespace) -> None:
+    """Print each expert's success rate with its interval."""
+    import pandas as pd
+    from tqdm.auto import tqdm
+
+    from fedvla_lib.compare import success_table
+    from fedvla_lib.evaluate import rollout_seeds
+    from fedvla_lib.expert import expert_success
+    from fedvla_lib.tasks import TASKS, check_tasks
+
+    _require_positive("--episodes", options.episodes)
+    tasks = check_tasks(options.task or list(TASKS))
+    rows = [row for task in tasks for row in expert_success(task, tqdm(rollout_seeds(options.episodes), desc=task))]
+    _print_table(success_table(pd.DataFrame(rows), ["task"]))
+
+
+def config(options: argparse.Namespace) -> None:
+    """Print the settings as TOML."""
+    for key, value in to_run_config(settings(options)).items():
+        print(f"{key} = {json.dumps(value)}")
+
+
+def train(options: argparse.Namespace) -> None:
+    """Train one policy, centrally or as one client alone, into a run folder."""
+    from fedvla_lib.run_folder import RunFolder, read_config, read_stamp, start, write_json
+
+    if options.resume:
+        root = options.resume
+        _train_into(RunFolder(root), read_config(root), options)
+        write_json(root / "stamp.json", {**read_stamp(root), "status": "completed", "resumed": True})
+        return
+    chosen = settings(options)
+    with start(chosen, engine="local") as folder:
+        _train_into(folder, chosen, options)
+
+
+def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> None:
+    from fedvla_lib import clients, prefix, wire
+    from fedvla_lib.model import save_policy
+    from fedvla_lib.train import local_train
+
+    learner = _learner(chosen, options.client)
+    bundle = clients.load_policy(chosen, wire.pack_stats(learner.statistics()))
+    steps = options.steps or chosen.num_server_rounds * chosen.local_steps
+    batches, checkpoints = prefix.stored(bundle, learner.batches()), folder.root / "checkpoints"
+    resume = options.resume is not None
+    result = local_train(bundle, batches, chosen, steps=steps, checkpoint_dir=checkpoints, resume=resume)
+    save_policy(bundle, folder.root / "model")
+    frames, measured = learner.validate(bundle)
+    folder.log(0, "local", "evaluate", measured)
+    print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
+    print(f"on {frames} held-out frames: " + ", ".join(f"{name} {value:.3f}" for name, value in measured.items()))
+    print(folder.root / "model")
+
+
+def _learner(chosen: Config, client: int | None) -> Any:
+    """Return the client that trains: number `client`, or one that holds everything."""
+    from fedvla_lib import clients, data
+
+    if client is not None:
+        return clients.open_client(chosen, client)
+    store = clients.open_frames(chosen)
+    return clients.Client(chosen, 0, store, clients.Share(*data.split(store, chosen.val_fraction, chosen.seed)))
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run a federation and print what was measured of the global model, round by round."""
+    from fedvla_lib.run_folder import read_metrics
+
+    chosen = settings(options)
+    folder = _engine(options.engine)(chosen)
+    rounds = read_metrics(folder, kind="evaluate")
+    _print_table(rounds[rounds.who == "global"].drop(columns=["who", "kind", "time"]))
+    print(folder)
+
+
+def _engine(name: str) -> Callable[[Config], Path]:
+    if name == "simulation":
+        from fedvla_lib.superlink import run_simulation
+
+        return run_simulation
+    from fedvla_lib.engine import run_inline
+
+    return run_inline
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    """Roll out a saved policy and print its success rates."""
+    import pandas as pd
+
+    from fedvla_lib.compare import success_table
+    from fedvla_lib.evaluate import evaluate as roll_out
+    from fedvla_lib.evaluate import rollout_seeds
+    from fedvla_lib.model import PolicyActor, load_policy
+    from fedvla_lib.run_folder import write_atomically
+    from fedvla_lib.tasks import TASKS, check_tasks
+
+    _require_positive("--rollouts", options.rollouts)
+    tasks = check_tasks(options.task or list(TASKS))
+    chosen = _saved_settings(options.policy)
+    actor = PolicyActor(load_policy(chosen), options.seed)
+    seeds, videos = rollout_seeds(options.rollouts), options.out and options.out / "videos"
+    rows = pd.DataFrame(roll_out(actor, tasks, seeds, image_size=chosen.image_size, videos_dir=videos))
+    if options.out:
+        write_atomically(options.out / "rows.csv", rows.to_csv(index=False).encode())
+    _print_table(success_table(rows, ["task"]))
+
+
+def _saved_settings(folder: Path) -> Config:
+    """Return settings that load the policy saved in `folder` as it was trained.
+
+    Raises:
+        ValueError: no pretrained_model folder, or one without our cameras.
+    """
+    if not (folder / "config.json").is_file():
+        raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
+    saved = json.loads((folder / "config.json").read_text())
+    shape = saved.get("input_features", {}).get(image_key(CAMERAS[0]), {}).get("shape")
+    if not shape:
+        raise ValueError(f"{folder} has no camera {CAMERAS[0]!r}: the simulator shows {', '.join(CAMERAS)}")
+    chunk = {name: saved[name] for name in ("chunk_size", "n_action_steps")}
+    return replace(Config(), base=str(folder), image_size=shape[-1], **chunk)
+
+
+def _require_positive(flag: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{flag} {value} is not usable: give 1 or more")
+
+
+def _print_table(table: Any) -> None:
+    print(table.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,85 @@
+"""The Flower ClientApp: unpack a message, call `clients`, pack the answer.
+
+Errors are not caught here: Flower turns them into error replies, which the server rejects by client name and reason.
+"""
+
+import tempfile
+from pathlib import Path
+
+from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.clientapp import ClientApp
+
+from fedvla_lib import clients, wire
+from fedvla_lib.config import from_run_config
+from fedvla_lib.model import Bundle
+from fedvla_lib.params import digest, load_arrays, shapes_of, trainable_arrays
+
+
+def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
+    """Return the ClientApp with handlers for query (statistics), train and evaluate."""
+    app = ClientApp()
+
+    @app.query()
+    def query(message: Message, context: Context) -> Message:
+        client = _client(context, tools)
+        answer = wire.note(
+            partition_id=client.partition_id,
+            num_examples=client.num_examples,
+            stats=wire.pack_stats(client.statistics()),
+        )
+        return Message(RecordDict({wire.NOTE: answer}), reply_to=message)
+
+    @app.train()
+    def train(message: Message, context: Context) -> Message:
+        client = _client(context, tools)
+        bundle = _global_policy(client, message, tools)
+        result = client.train(bundle, message.content[wire.CONFIG][wire.ROUND])
+        arrays = trainable_arrays(bundle.policy)
+        metrics = {
+            wire.EXAMPLES: result.num_examples,
+            "loss": sum(result.losses) / len(result.losses),
+            "seconds": result.seconds,
+        }
+        content = {
+            wire.ARRAYS: wire.pack_arrays(arrays),
+            wire.METRICS: MetricRecord(metrics),
+            wire.NOTE: wire.note(sha256=digest(arrays)),
+        }
+        return Message(RecordDict(content), reply_to=message)
+
+    @app.evaluate()
+    def evaluate(message: Message, context: Context) -> Message:
+        client = _client(context, tools)
+        bundle = _global_policy(client, message, tools)
+        examples, metrics = client.validate(bundle)
+        content = {
+            wire.METRICS: MetricRecord({wire.EXAMPLES: examples, **metrics}),
+            wire.NOTE: _rollouts(client, bundle, message.content[wire.CONFIG][wire.ROUND]),
+        }
+        return Message(RecordDict(content), reply_to=message)
+
+    return app
+
+
+def _client(context: Context, tools: clients.Tools) -> clients.Client:
+    config = from_run_config(context.run_config)
+    if wire.PARTITION not in context.node_config:
+        raise ValueError(f"this node has no {wire.PARTITION}: start it with --node-config 'partition-id=K'")
+    return clients.open_client(config, int(context.node_config[wire.PARTITION]), tools)
+
+
+def _global_policy(client: clients.Client, message: Message, tools: clients.Tools) -> Bundle:
+    """Return the policy holding the global arrays of the message, once they have passed every check."""
+    bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
+    shapes = shapes_of(trainable_arrays(bundle.policy))
+    load_arrays(bundle.policy, wire.checked_arrays(message.content, wire.CONFIG, shapes))
+    return bundle
+
+
+def _rollouts(client: clients.Client, bundle: Bundle, round_number: int) -> ConfigRecord:
+    with tempfile.TemporaryDirectory() as folder:
+        due = clients.rolls_out(client.config, round_number)
+        return wire.pack_rollouts(client.roll_out(bundle, Path(folder)) if due else [], Path(folder))
+
+
+app = build()

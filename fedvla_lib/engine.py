@@ -1,0 +1,153 @@
+"""Ways to run the one Flower app: here in this process, or on Flower's own runtimes with the same settings.
+
+`run_inline` is for notebooks, tests and breakpoints: a `Grid` of Flower's that calls the ClientApp in this process, one
+client after the other in the order of their partitions. Scale comes from Flower's engines, which run the same apps.
+"""
+
+import copy
+import functools
+import logging
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flwr.app import Context, Error, Message, RecordDict, UserConfig
+from flwr.clientapp import ClientApp
+from flwr.common.constant import SUPERLINK_NODE_ID, ErrorCode
+from flwr.serverapp import Grid
+from flwr.supercore.run import Run
+from flwr.supercore.task_identity import TaskIdentity
+from tqdm.auto import tqdm
+
+from fedvla_lib import client_app, clients, server_app
+from fedvla_lib.config import Config, check, to_run_config
+
+logger = logging.getLogger(__name__)
+RUN_ID = 1
+FIRST_NODE_ID = SUPERLINK_NODE_ID + 1
+
+
+def run_inline(
+    config: Config, *, clients_app: ClientApp | None = None, progress: bool = True, raise_errors: bool = False
+) -> Path:
+    """Run a federation in this process and return its run folder; the same settings give the same bits.
+
+    Args:
+        clients_app: the ClientApp to call; default this library's, with frames and policy opened once for all clients.
+        progress: show a bar over the clients of each round.
+        raise_errors: let a client's exception surface (for debugging) instead of rejecting its reply.
+
+    Raises:
+        TooFewReplies: a round had fewer good replies than `config.min_replies`; what was written so far stays.
+        ValueError: settings, data or output folder that cannot be used.
+    """
+    tools = remembering(clients.TOOLS)
+    app = clients_app or client_app.build(tools)
+    run_config = to_run_config(check(config))
+    context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
+    claim_identity()
+    with _quiet_flower():
+        grid = InlineGrid(app, config.num_clients, run_config, progress=progress, raise_errors=raise_errors)
+        server_app.build(tools, engine="inline", progress=progress)(grid, context)
+    return Path(context.state["run"]["folder"])
+
+
+def remembering(tools: clients.Tools) -> clients.Tools:
+    """Return tools that open the frames and build the policy once and lend them to whoever asks again."""
+    return clients.Tools(functools.cache(tools.open_frames), functools.cache(tools.load_policy))
+
+
+class InlineGrid(Grid):
+    """Flower's grid without a network: a message sent is handled at once, an exception becomes an error reply.
+
+    Args:
+        app: handles the messages of all clients.
+        num_clients: clients there are; client k is node ``FIRST_NODE_ID + k``, with partition-id k and its own context.
+        run_config: settings of the run, as Flower passes them.
+    """
+
+    def __init__(
+        self,
+        app: ClientApp,
+        num_clients: int,
+        run_config: UserConfig,
+        *,
+        progress: bool = False,
+        raise_errors: bool = False,
+    ) -> None:
+        self._app, self._progress, self._raise_errors = app, progress, raise_errors
+        self._run = Run.create_empty(RUN_ID)
+        self._replies: dict[str, Message] = {}
+        self._sent = 0
+        self._contexts = {}
+        for k in range(num_clients):
+            node, node_config = FIRST_NODE_ID + k, {"partition-id": k, "num-partitions": num_clients}
+            self._contexts[node] = Context(RUN_ID, node, node_config, RecordDict(), dict(run_config))
+
+    def set_run(self, run: Run) -> None:
+        """Take over the description of the run."""
+        self._run = run
+
+    @property
+    def run(self) -> Run:
+        """Description of the run."""
+        return self._run
+
+    def create_message(
+        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
+    ) -> Message:
+        """Return a message to a node, as Flower's constructor does."""
+        return Message(content, dst_node_id, message_type, ttl=ttl, group_id=group_id)
+
+    def get_node_ids(self) -> list[int]:
+        """Return the node ids in the order of partitions."""
+        return list(self._contexts)
+
+    def push_messages(self, messages: Iterable[Message]) -> list[str]:
+        """Handle each message in the order of nodes, and return one id per message."""
+        ordered = sorted(messages, key=lambda message: message.metadata.dst_node_id)
+        kind = ordered[0].metadata.message_type if ordered else ""
+        bar = tqdm(ordered, desc=f"clients: {kind}", disable=not (self._progress and ordered), leave=False)
+        return [self._handle(message) for message in bar]
+
+    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
+        """Hand out the replies to the given messages, once."""
+        return [self._replies.pop(key) for key in message_ids if key in self._replies]
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
+        """Push and pull; there is nothing to wait for, so `timeout` has no effect."""
+        return self.pull_messages(self.push_messages(messages))
+
+    def _handle(self, message: Message) -> str:
+        """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""
+        self._sent += 1
+        key = str(self._sent)
+        node = message.metadata.dst_node_id
+        try:
+            self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])
+        except Exception as error:
+            if self._raise_errors:
+                raise
+            logger.debug("client on node %d raised\n%s", node, traceback.format_exc())
+            reason = f"{type(error).__name__}: {error}"
+            failure = Error(code=ErrorCode.CLIENT_APP_RAISED_EXCEPTION, reason=reason)
+            self._replies[key] = Message(failure, reply_to=message)
+        return key
+
+
+def claim_identity() -> None:
+    """Tell Flower's message class who this process is, as Flower's runtimes do before they start an app."""
+    TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SUPERLINK_NODE_ID, 0
+
+
+@contextmanager
+def _quiet_flower() -> Iterator[None]:
+    """Keep Flower's line per event out of notebooks: the run folder has it all."""
+    flower = logging.getLogger("flwr")
+    before = flower.level
+    flower.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        flower.setLevel(before)

@@ -1,0 +1,210 @@
+"""Scripted demonstrators: they know where the cube is, plan a path for the gripper and solve it with mink.
+
+The path is a list of `Waypoint`s for the grasp point between the finger tips, always with the gripper pointing down.
+Between waypoints the grasp point moves with a smooth speed profile, so that a demonstration has neither jumps nor
+pauses: what to do next can be read from the pictures and the joint positions.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+# isort: off
+from fedvla_lib.scene import GRASP_SITE, build_arm  # before mink, which loads mujoco
+import mink
+# isort: on
+
+import numpy as np
+from tqdm import tqdm
+
+from fedvla_lib.rollout import run_episode
+from fedvla_lib.sim import So100Env, from_radians, to_radians
+from fedvla_lib.spec import NUM_JOINTS, Observation
+
+OPEN, CLOSED = 34.0, 4.0  # gripper commands: wide enough for a turned cube, and firm
+FORK = 13.0  # gripper opening at which both finger tips push one face of the cube
+FORK_GAP_M = 0.040  # how far beside the cube's centre the fork comes down
+FORK_CONTACT_M = 0.022  # distance from the fork to the cube's centre while it pushes
+GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
+PUSH_HEIGHT_M = 0.018
+HOVER_HEIGHT_M = 0.075
+CARRY_HEIGHT_M = 0.080
+LIFT_HEIGHT_M = 0.095
+SIDESTEP_M = 0.009  # open jaws come down this far towards the fixed one's side, so that neither grazes the cube
+CLOSE_STEPS = OPEN_STEPS = 4
+MIN_STEPS = 4
+SPEED_M = 0.011  # how far the grasp point travels in one control step, on average
+SOLVER_STEPS = 60  # at most so many iterations of inverse kinematics per control step
+SOLVER_TOLERANCE_RAD = 2e-4  # a smaller correction ends the iteration
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Where the grasp point should be, `steps` control steps after the waypoint before."""
+
+    position_m: tuple[float, float, float]
+    yaw_rad: float  # turn of the gripper about the vertical; at 0 the jaws close along y
+    gripper: float  # 0-100
+    steps: int
+
+
+class Expert:
+    """An Actor for each of our tasks; it reads the true layout from the environment when an episode starts."""
+
+    def __init__(self) -> None:
+        self._arm = _Arm()
+
+    def reset(self, env: Any, seed: int) -> None:
+        """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not needed."""
+        sim: So100Env = env.unwrapped
+        start = self._arm.start(sim.joints)
+        self._path = _interpolate(start, PLANS[sim.task](sim, start))
+        self._step = 0
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the next joint targets, float32 (6,), LeRobot units; after the plan's end its last ones."""
+        target = self._path[min(self._step, len(self._path) - 1)]
+        self._step += 1
+        return self._arm.solve(target)
+
+
+def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
+    """Run the expert without cameras on each seed; rows with task, seed, success and steps."""
+    env = So100Env(task, cameras=(), render_mode=None)
+    expert, rows = Expert(), []
+    for seed in tqdm(seeds, desc=f"expert {task}", disable=None):
+        episode = run_episode(env, expert, seed)
+        rows.append({"task": task, "seed": seed, "success": episode.success, "steps": episode.num_frames})
+    env.close()
+    return rows
+
+
+class _Arm:
+    """Inverse kinematics of the arm alone, warm-started from one control step to the next."""
+
+    def __init__(self) -> None:
+        model = build_arm()
+        self._limits_rad = model.jnt_range[:NUM_JOINTS].copy()
+        self._configuration = mink.Configuration(model)
+        self._task = mink.FrameTask(GRASP_SITE, "site", position_cost=1.0, orientation_cost=0.05, lm_damping=1e-6)
+        self._limits = [mink.ConfigurationLimit(model)]
+
+    def start(self, joints: np.ndarray) -> Waypoint:
+        """Take over the joint positions, LeRobot units, and return where the grasp point is with them."""
+        self._configuration.update(to_radians(joints, self._limits_rad))
+        pose = self._configuration.get_transform_frame_to_world(GRASP_SITE, "site")
+        across = pose.rotation().as_matrix()[:, 0]
+        yaw_rad = float(np.arctan2(-across[0], across[1]))
+        return Waypoint(tuple(pose.translation()), yaw_rad, float(joints[-1]), 0)
+
+    def solve(self, target: Waypoint) -> np.ndarray:
+        """Joint targets that put the grasp point at `target`, float32 (6,), LeRobot units."""
+        self._task.set_target(_pose(target))
+        for _ in range(SOLVER_STEPS):
+            velocity = mink.solve_ik(self._configuration, [self._task], 1.0, "daqp", damping=1e-6, limits=self._limits)
+            self._configuration.integrate_inplace(velocity, 1.0)
+            if np.linalg.norm(velocity) < SOLVER_TOLERANCE_RAD:
+                break
+        joints = from_radians(self._configuration.q, self._limits_rad)
+        joints[-1] = target.gripper
+        return joints
+
+
+def _pose(target: Waypoint) -> mink.SE3:
+    """Gripper down: the site's y axis points up, its x axis runs across the jaws."""
+    across = np.array([-np.sin(target.yaw_rad), np.cos(target.yaw_rad), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    rotation = np.column_stack([across, up, np.cross(across, up)])
+    return mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotation), np.array(target.position_m))
+
+
+def _interpolate(start: Waypoint, plan: list[Waypoint]) -> list[Waypoint]:
+    """One waypoint per control step, along straight lines with speeds that start and end gently."""
+    path = []
+    for begin, end in pairwise([start, *plan]):
+        for step in range(1, end.steps + 1):
+            path.append(_between(begin, end, _smooth(step / end.steps)))
+    return path
+
+
+def _between(begin: Waypoint, end: Waypoint, share: float) -> Waypoint:
+    position_m = (1 - share) * np.array(begin.position_m) + share * np.array(end.position_m)
+    yaw_rad = (1 - share) * begin.yaw_rad + share * end.yaw_rad
+    return Waypoint(tuple(position_m), yaw_rad, (1 - share) * begin.gripper + share * end.gripper, 1)
+
+
+def _smooth(share: float) -> float:
+    return share * share * (3 - 2 * share)
+
+
+def _move(begin: Waypoint, position_m: tuple[float, float, float], yaw_rad: float, gripper: float) -> Waypoint:
+    """A waypoint whose number of steps follows from the distance."""
+    distance_m = float(np.linalg.norm(np.subtract(position_m, begin.position_m)))
+    return Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M)))
+
+
+def _grasp(env: So100Env, start: Waypoint) -> list[Waypoint]:
+    """Hover over the cube, descend, close."""
+    x, y, _ = env.cube_m
+    yaw = env.layout.cube_yaw_rad
+    around = _sidestep(x, y, yaw)
+    hover = _move(start, (*around, HOVER_HEIGHT_M), yaw, OPEN)
+    down = _move(hover, (*around, GRASP_HEIGHT_M), yaw, OPEN)
+    return [hover, down, Waypoint((x, y, GRASP_HEIGHT_M), yaw, CLOSED, CLOSE_STEPS)]
+
+
+def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
+    """Where open jaws are centred on (x, y): only one jaw moves, so closed they are centred elsewhere."""
+    return x - SIDESTEP_M * np.sin(yaw_rad), y + SIDESTEP_M * np.cos(yaw_rad)
+
+
+def _lift_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
+    path = _grasp(env, start)
+    x, y, _ = env.cube_m
+    return [*path, _move(path[-1], (x, y, LIFT_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+
+
+def _place_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
+    """Carry the cube over the zone along an arc around the base, set it down, let go, rise."""
+    path = _grasp(env, start)
+    x, y, _ = env.cube_m
+    path.append(_move(path[-1], (x, y, CARRY_HEIGHT_M), path[-1].yaw_rad, CLOSED))
+    path += _arc(path[-1], env.layout.zone_xy_m, CARRY_HEIGHT_M, CLOSED)
+    zone_x, zone_y = env.layout.zone_xy_m
+    path.append(_move(path[-1], (zone_x, zone_y, GRASP_HEIGHT_M), path[-1].yaw_rad, CLOSED))
+    around = _sidestep(zone_x, zone_y, path[-1].yaw_rad)
+    path.append(Waypoint((*around, GRASP_HEIGHT_M), path[-1].yaw_rad, OPEN, OPEN_STEPS))
+    return [*path, _move(path[-1], (*around, HOVER_HEIGHT_M), path[-1].yaw_rad, OPEN)]
+
+
+def _push_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
+    """Come down beside the cube with the jaws as a fork, sweep it along an arc into the zone, draw back a little."""
+    x, y, _ = env.cube_m
+    radius_m, bearing = float(np.hypot(x, y)), float(np.arctan2(y, x))
+    beside = bearing - FORK_GAP_M / radius_m
+    x, y = radius_m * np.cos(beside), radius_m * np.sin(beside)
+    hover = _move(start, (x, y, HOVER_HEIGHT_M), beside + np.pi / 2, FORK)
+    down = _move(hover, (x, y, PUSH_HEIGHT_M), beside + np.pi / 2, FORK)
+    zone_radius_m, zone_bearing = np.hypot(*env.layout.zone_xy_m), np.arctan2(*env.layout.zone_xy_m[::-1])
+    end = zone_bearing - FORK_CONTACT_M / zone_radius_m
+    sweep = _arc(down, (zone_radius_m * np.cos(end), zone_radius_m * np.sin(end)), PUSH_HEIGHT_M, FORK)
+    return [hover, down, *sweep]
+
+
+def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
+    """The way to `end_xy_m` around the base, turning the gripper along, as short pieces at one speed."""
+    x, y, z = begin.position_m
+    turn = np.arctan2(end_xy_m[1], end_xy_m[0]) - np.arctan2(y, x)
+    radii_m = np.hypot(x, y), np.hypot(*end_xy_m)
+    steps = max(MIN_STEPS, round(abs(turn) * max(radii_m) / SPEED_M))
+    path = []
+    for step in range(1, steps + 1):
+        share = _smooth(step / steps)
+        radius_m, bearing = (1 - share) * radii_m[0] + share * radii_m[1], np.arctan2(y, x) + share * turn
+        position_m = (radius_m * np.cos(bearing), radius_m * np.sin(bearing), (1 - share) * z + share * height_m)
+        path.append(Waypoint(position_m, begin.yaw_rad + share * turn, gripper, 1))
+    return path
+
+
+PLANS = {"lift": _lift_plan, "place": _place_plan, "push": _push_plan}

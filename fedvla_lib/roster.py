@@ -1,0 +1,123 @@
+"""Who takes part: Flower's nodes have random ids, ours hold partitions, and one question per run tells which."""
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from flwr.app import Message, MessageType, RecordDict
+from flwr.serverapp import Grid
+
+from fedvla_lib.params import ParameterError
+from fedvla_lib.spec import ACTION_KEY, STATE_KEY
+from fedvla_lib.wire import NOTE, Stats, unpack_stats
+
+# Called with (round, who, kind, values) for everything worth keeping; a run folder's `log` fits.
+Report = Callable[[int, str, str, dict[str, Any]], None]
+
+
+class TooFewReplies(RuntimeError):
+    """A round has fewer good replies than the run requires."""
+
+
+@dataclass(frozen=True)
+class Introduction:
+    """What a client says about itself before training."""
+
+    partition_id: int
+    num_examples: int  # training frames
+    stats: Stats
+
+
+@dataclass(frozen=True)
+class Roster:
+    """Which node holds which partition."""
+
+    partition_of: dict[int, int]  # node id -> partition id
+
+    def name(self, node_id: int) -> str:
+        """Return the client's name: ``client_3`` holds partition 3."""
+        return client_name(self.partition_of[node_id])
+
+    def draw(self, share: float, rng: np.random.Generator) -> list[int]:
+        """Draw a share of the clients without replacement (one at least, none if it is 0): node ids by partition."""
+        nodes = sorted(self.partition_of, key=self.partition_of.get)
+        size = max(1, round(share * len(nodes))) if share else 0
+        return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
+
+
+def client_name(partition_id: int) -> str:
+    """Return the name a client has in metrics, folders and messages."""
+    return f"client_{partition_id}"
+
+
+def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
+    """Return the ids of all connected nodes once there are `num_clients`.
+
+    Raises:
+        TooFewReplies: fewer have connected when the time is up.
+    """
+    deadline = time.monotonic() + timeout_s
+    while len(nodes := sorted(grid.get_node_ids())) < num_clients:
+        if time.monotonic() > deadline:
+            raise TooFewReplies(
+                f"{len(nodes)} of num-clients={num_clients} clients connected within {timeout_s:.0f} s: start more "
+                f"(flwr run --federation-config num-supernodes={num_clients}) or give num-clients={len(nodes) or 1}"
+            )
+        time.sleep(0.5)
+    return nodes
+
+
+def call(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> tuple[Roster, list[Introduction]]:
+    """Ask every node for its partition, frames and statistics; leave out, and report, whose answer cannot be used.
+
+    Returns:
+        the roster, and the introductions in the order of partitions.
+    """
+    messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
+    replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
+    known: dict[int, Introduction] = {}
+    for reply in replies:
+        try:
+            known[reply.metadata.src_node_id] = _introduction(reply, known.values())
+        except ParameterError as error:
+            values = {"to": "query", "reason": error.kind, "detail": str(error)}
+            report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
+    by_partition = sorted(known, key=lambda node: known[node].partition_id)
+    return Roster({node: known[node].partition_id for node in by_partition}), [known[node] for node in by_partition]
+
+
+def answered(reply: Message | None) -> Message:
+    """Return `reply` if the client answered with content.
+
+    Raises:
+        ParameterError: no answer, or an error in its place.
+    """
+    if reply is None:
+        raise ParameterError("silent", "no reply came in time")
+    if reply.has_error():
+        raise ParameterError("error", " ".join(str(reply.error.reason).split()) or f"error code {reply.error.code}")
+    return reply
+
+
+def _introduction(reply: Message, others: Iterable[Introduction]) -> Introduction:
+    note = answered(reply).content.config_records.get(NOTE, {})
+    partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
+    if not isinstance(partition_id, int) or partition_id in {other.partition_id for other in others}:
+        raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
+    if not isinstance(num_examples, int) or num_examples <= 0:
+        raise ParameterError("examples", f"num-examples={num_examples!r}: expected training frames above 0")
+    return Introduction(partition_id, num_examples, _statistics(note.get("stats")))
+
+
+def _statistics(text: Any) -> Stats:
+    try:
+        stats = unpack_stats(text)
+        usable = all(np.isfinite(stats[key][name]).all() for key in (STATE_KEY, ACTION_KEY) for name in ("mean", "std"))
+    except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
+        raise ParameterError("statistics", f"statistics cannot be read: {error!r}") from error
+    if not usable:
+        raise ParameterError("statistics", "statistics hold values that are not finite")
+    return stats

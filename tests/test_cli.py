@@ -1,0 +1,196 @@
+"""The command line: one line and status 2 for bad input, status 130 and a kept recording after Ctrl-C."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fedvla_lib.cli import build_parser, main, settings
+from fedvla_lib.config import Config, from_profile, from_run_config
+
+COMMANDS = ["doctor", "record", "experts", "config", "train", "run", "evaluate"]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0 and "usage: fedvla " + command in capsys.readouterr().out
+
+
+@pytest.mark.unit
+def test_config_prints_toml_that_flower_can_read(capsys):
+    assert main(["config", "--profile", "tiny", "--num-server-rounds", "3", "--lr", "2e-5", "--augment"]) == 0
+    printed = tomllib.loads(capsys.readouterr().out)
+    assert from_run_config(printed) == from_profile("tiny", num_server_rounds=3, lr=2e-5, augment=True)
+
+
+@pytest.mark.unit
+def test_every_setting_is_a_flag_and_unset_flags_leave_the_profile_alone():
+    parser = build_parser()
+    assert settings(parser.parse_args(["run", "--profile", "laptop"])) == Config()
+    assert settings(parser.parse_args(["run", "--profile", "gpu"])) == from_profile("gpu")
+    assert settings(parser.parse_args(["train", "--no-freeze-vision-encoder"])).freeze_vision_encoder is False
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["config", "--profile", "huge"], "unknown profile 'huge': choose one of tiny, laptop, gpu"),
+        (["config", "--num-clients", "0"], "num-clients=0 is not usable"),
+        (["run", "--partition", "alphabet"], "partition='alphabet' is not usable"),
+        (["record", "--task", "juggle", "--out", "{tmp}/rec"], "unknown task 'juggle': choose one of lift"),
+        (["record", "--episodes", "0"], "episodes-per-task=0 is not usable"),
+        (["experts", "--episodes", "0"], "--episodes 0 is not usable: give 1 or more"),
+        (["experts", "--task", "juggle"], "unknown task 'juggle'"),
+        (["evaluate", "{tmp}"], "{tmp} is not a pretrained_model folder: it has no config.json"),
+        (["evaluate", "{tmp}", "--rollouts", "0"], "--rollouts 0 is not usable"),
+        (["train", "--resume", "{tmp}/none"], "{tmp}/none"),
+        (["train", "--profile", "tiny", "--client", "9", "--out", "{tmp}/out"], "partition-id=9"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(tmp_path / "cache"))
+    assert main([part.format(tmp=tmp_path) for part in arguments]) == 2
+    captured = capsys.readouterr()
+    assert said.format(tmp=tmp_path) in captured.err and captured.err.startswith(f"fedvla {arguments[0]}: ")
+    assert captured.err.count("\n") == 1 and "Traceback" not in captured.err and captured.out == ""
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("arguments", [[], ["cook"], ["config", "--lr", "fast"], ["run", "--rounds", "3"]])
+def test_bad_usage_is_one_line_and_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    captured = capsys.readouterr()
+    assert ended.value.code == 2 and captured.err.count("\n") == 1 and "--help" in captured.err
+
+
+@pytest.mark.unit
+def test_traceback_on_request(capsys):
+    assert main(["--traceback", "config", "--num-clients", "0"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.unit
+def test_policy_without_our_cameras_is_refused(tmp_path, capsys):
+    (tmp_path / "config.json").write_text(json.dumps({"input_features": {}, "chunk_size": 4, "n_action_steps": 2}))
+    assert main(["evaluate", str(tmp_path)]) == 2
+    assert "has no camera 'overhead'" in capsys.readouterr().err
+
+
+@pytest.mark.integration
+def test_experts_prints_a_rate_with_its_interval(capsys):
+    assert main(["experts", "--task", "lift", "--episodes", "2"]) == 0
+    header, row = capsys.readouterr().out.strip().splitlines()
+    assert header.split() == ["task", "n", "successes", "success_rate", "low", "high"]
+    assert row.split()[:3] == ["lift", "2", "2"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    """One recording and one decoded store for all tests of this module."""
+    return tmp_path_factory.mktemp("cache")
+
+
+TINY = ["--profile", "tiny", "--tasks", "lift", "--episodes-per-task", "4", "--base", "nano", "--num-clients", "2"]
+
+
+@pytest.mark.integration
+def test_train_then_evaluate(cache, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+    out = tmp_path / "outputs"
+    assert main(["train", *TINY, "--steps", "2", "--val-fraction", "0.25", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "2 steps in" in printed and "held-out frames: loss" in printed
+    policy = Path(printed.splitlines()[-1])
+    assert (policy / "model.safetensors").is_file() and policy.parent.parent == out
+    rollouts = tmp_path / "rollouts"
+    assert main(["evaluate", str(policy), "--task", "lift", "--rollouts", "1", "--out", str(rollouts)]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[:2] == ["lift", "1"]
+    assert len((rollouts / "rows.csv").read_text().splitlines()) == 2
+    assert len(list((rollouts / "videos").glob("*.mp4"))) == 1
+
+
+@pytest.mark.integration
+def test_resumed_training_ends_like_an_uninterrupted_one(cache, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+    common = [*TINY, "--client", "1", "--checkpoint-every", "1", "--out"]
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    assert main(["train", "--steps", "2", *common, str(whole)]) == 0
+    assert main(["train", "--steps", "2", *common, str(halves)]) == 0
+    root = next(halves.iterdir())
+    _undo_last_step(root)
+    assert main(["train", "--resume", str(root), "--client", "1", "--steps", "2"]) == 0
+    weights = [next(path.glob("*/model/model.safetensors")) for path in (whole, halves)]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
+    assert json.loads((root / "stamp.json").read_text())["status"] == "completed"
+
+
+def _undo_last_step(root: Path) -> None:
+    """Leave a run folder as a training that was killed after its first checkpoint leaves it."""
+    checkpoints = sorted((root / "checkpoints").iterdir())
+    assert len(checkpoints) == 2
+    for folder in (checkpoints[-1], root / "model"):
+        for path in sorted(folder.rglob("*"), reverse=True):
+            path.rmdir() if path.is_dir() else path.unlink()
+        folder.rmdir()
+
+
+@pytest.mark.integration
+def test_run_prints_the_rounds_and_the_run_folder(cache, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+    out = tmp_path / "outputs"
+    assert main(["run", *TINY, "--num-server-rounds", "1", "--client-rollouts", "0", "--out", str(out)]) == 0
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert "round" in lines[0].split() and "loss" in lines[0].split()
+    root = Path(lines[-1])
+    assert root.parent == out and (root / "global_model" / "round_1" / "model.safetensors").is_file()
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(os.name != "posix", reason="sends a POSIX signal")
+def test_ctrl_c_keeps_complete_episodes_and_the_recording_goes_on(tmp_path):
+    root = tmp_path / "demos"
+    arguments = ["record", "--task", "lift", "--image-size", "64", "--out", str(root), "--episodes"]
+    command = [sys.executable, "-m", "fedvla_lib.cli", *arguments, "500"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    _wait_for_episodes(root, process, at_least=2)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "interrupted: complete episodes are kept, the same command continues" in said
+    assert "Traceback" not in said
+    kept = _num_episodes(root)
+    assert 2 <= kept < 500
+    assert main([*arguments, str(kept + 1)]) == 0
+    assert _num_episodes(root) == kept + 1
+
+
+def _wait_for_episodes(root: Path, process: subprocess.Popen, at_least: int) -> None:
+    deadline = time.monotonic() + 180
+    while _num_episodes(root) < at_least:
+        assert process.poll() is None and time.monotonic() < deadline, "the recording did not get going"
+        time.sleep(0.1)
+
+
+def _num_episodes(root: Path) -> int:
+    info = root / "meta" / "info.json"
+    return json.loads(info.read_text())["total_episodes"] if info.is_file() else 0
+
+
+@pytest.mark.unit
+def test_no_heavy_package_is_loaded_for_help_and_settings():
+    code = "import sys; from fedvla_lib.cli import main; main(['config']); print(sorted(sys.modules), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(re.findall(r"'(\w+)'", done.stderr))
+    assert not loaded & {"torch", "lerobot", "flwr", "mujoco", "matplotlib", "pandas"}

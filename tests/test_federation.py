@@ -1,0 +1,299 @@
+"""The federation end to end, on a real nano SmolVLA and recorded demonstrations, in the inline engine.
+
+Faults are injected by real ClientApps around the library's own: they let it work and then damage its reply.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.clientapp import ClientApp
+from safetensors.numpy import load_file
+
+from fedvla_lib import client_app, clients, data, engine, model, run_folder, train, wire
+from fedvla_lib.config import from_profile
+from fedvla_lib.evaluate import read_video
+from fedvla_lib.params import digest, shapes_of, trainable_arrays
+from fedvla_lib.roster import TooFewReplies
+from fedvla_lib.spec import ACTION_KEY, STATE_KEY
+
+pytestmark = pytest.mark.integration
+NO_ROLLOUTS = {"eval_rollouts": 0, "client_rollouts": 0}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """Settings of the tiny profile from random weights; its demonstrations are recorded once and cached."""
+    return from_profile("tiny", base="nano", num_threads=1, out=str(tmp_path_factory.mktemp("outputs")))
+
+
+@pytest.fixture(scope="module")
+def full_run(tiny):
+    """A run with everything in it: warm start, three clients, two rounds, rollouts and videos after the last."""
+    return engine.run_inline(replace(tiny, base="nano-warm", tasks="lift,push"), progress=False)
+
+
+def global_weights(root: Path, round_number: int) -> dict[str, np.ndarray]:
+    return load_file(root / f"global_model/round_{round_number}/model.safetensors")
+
+
+def same(left, right) -> bool:
+    return left.keys() == right.keys() and all(np.array_equal(left[name], right[name]) for name in left)
+
+
+def test_one_client_averaging_equals_local_training_bit_for_bit(tiny):
+    config = replace(tiny, num_clients=1, num_server_rounds=2, local_steps=3, **NO_ROLLOUTS)
+    federated = global_weights(engine.run_inline(config, progress=False), 2)
+
+    store = clients.open_frames(config)
+    train_ids, _ = data.split(store, config.val_fraction, config.seed)
+    bundle = model.load_policy(config, data.pool_stats([data.episode_stats(store, train_ids)]))
+    batches = data.Batches(
+        store, train_ids, config.chunk_size, config.batch_size, clients.client_seed(config.seed, 0), config.augment
+    )
+    for start_step in (0, 3):
+        train.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
+    local = trainable_arrays(bundle.policy)
+    assert same({name: federated[name] for name in local}, local)
+
+
+def test_two_runs_with_one_seed_agree_bit_for_bit_and_another_seed_does_not(tiny):
+    config = replace(tiny, fraction_train=0.7, **NO_ROLLOUTS)
+    first, second = (engine.run_inline(config, progress=False) for _ in range(2))
+    assert first != second
+    for round_number in range(3):
+        assert same(global_weights(first, round_number), global_weights(second, round_number))
+    drop = ["time", "seconds"]
+    left, right = (run_folder.read_metrics(root).drop(columns=drop) for root in (first, second))
+    assert left.equals(right)
+    assert not same(global_weights(first, 1), global_weights(first, 2))
+    other = engine.run_inline(replace(config, seed=1, data=str(data.resolve(config))), progress=False)
+    assert not same(global_weights(first, 1), global_weights(other, 1))
+
+
+def test_a_run_folder_holds_what_the_book_needs(full_run):
+    config = run_folder.read_config(full_run)
+    stamp = run_folder.read_stamp(full_run)
+    assert (stamp["status"], stamp["engine"], stamp["seed"]) == ("completed", "inline", config.seed)
+    assert stamp["wall_s"] > 0 and stamp["versions"]["flwr"]
+    metrics = run_folder.read_metrics(full_run, "evaluate")
+    on_server = metrics[metrics.who == "global"].set_index("round")
+    assert list(on_server.index) == [0, 1, 2]
+    assert on_server[["loss", "action_error", "action_accuracy"]].notna().all(axis=None)
+    assert on_server.success_rate.notna().tolist() == [False, False, True]
+    assert set(run_folder.read_metrics(full_run, "train").who) == {"client_0", "client_1", "client_2"}
+    for round_number in range(3):
+        bundle = model.load_policy(replace(config, base=str(full_run / f"global_model/round_{round_number}")))
+        assert shapes_of(trainable_arrays(bundle.policy))
+
+
+def test_videos_come_back_from_every_client_and_play(full_run):
+    rollouts = run_folder.read_metrics(full_run, "rollout")
+    assert set(rollouts.who) == {"global", "client_0", "client_1", "client_2"}
+    assert rollouts.groupby("who").size().to_dict()["global"] == 2  # one per task
+    for who, video, steps in zip(rollouts.who, rollouts.video, rollouts.steps, strict=True):
+        assert video.startswith(f"evaluate/round_2/{who}/rollout_")
+        assert len(read_video(full_run / video)) == steps
+    scenes = rollouts[rollouts.who != "global"]
+    assert scenes.seed.is_unique
+
+
+def test_a_reloaded_global_model_measures_the_same(full_run):
+    config = run_folder.read_config(full_run)
+    store = clients.open_frames(config)
+    bundle = model.load_policy(replace(config, base=str(full_run / "global_model/round_2")))
+    frames, again = clients.validate(bundle, store, clients.held_out_episodes(store, config), config)
+    logged = run_folder.read_metrics(full_run, "evaluate").query("who == 'global' and round == 2").iloc[0]
+    assert frames == logged.num_examples
+    assert again["loss"] == pytest.approx(logged.loss, rel=1e-6)
+    assert again["action_error"] == pytest.approx(logged.action_error, rel=1e-5)
+
+
+def test_clients_weigh_by_their_training_frames_and_normalise_with_pooled_statistics(full_run):
+    config = run_folder.read_config(full_run)
+    store = clients.open_frames(config)
+    shares = clients.shares(store, config)
+    frames = {f"client_{k}": clients.num_frames(store, share.train_ids) for k, share in enumerate(shares)}
+    trained = run_folder.read_metrics(full_run, "train")
+    assert all(frames[who] == weight for who, weight in zip(trained.who, trained.num_examples, strict=True))
+    assert len(set(frames.values())) > 1
+
+    folder = full_run / "global_model/round_2"
+    saved = load_file(next(folder.glob("policy_preprocessor_step_*normalizer*.safetensors")))
+    pooled = data.episode_stats(store, [episode for share in shares for episode in share.train_ids])
+    for key in (STATE_KEY, ACTION_KEY):
+        np.testing.assert_allclose(saved[f"{key}.mean"], pooled[key]["mean"], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(saved[f"{key}.std"], pooled[key]["std"], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("scheme", ["modulo", "task", "dirichlet"])
+def test_nothing_held_out_is_trained_on_and_nobody_shares(tiny, scheme):
+    store = clients.open_frames(tiny)
+    shares = clients.shares(store, replace(tiny, partition=scheme))
+    trained = [episode for share in shares for episode in share.train_ids]
+    held_out = [episode for share in shares for episode in share.val_ids]
+    assert sorted(trained + held_out) == sorted(store.episodes.episode_id)
+    assert sorted(held_out) == sorted(clients.held_out_episodes(store, tiny))
+    for share in shares:
+        assert set(clients.tasks_of(store, share.val_ids)) <= set(clients.tasks_of(store, share.train_ids))
+
+
+def damaging(damage_of, tools) -> ClientApp:
+    """The library's ClientApp, whose training reply passes through ``damage_of[partition_id]`` where there is one."""
+    inner, outer = client_app.build(tools), ClientApp()
+
+    @outer.query()
+    def query(message: Message, context: Context) -> Message:
+        return inner(message, context)
+
+    @outer.train()
+    def train(message: Message, context: Context) -> Message:
+        content = inner(message, context).content
+        damage = damage_of.get(context.node_config["partition-id"], lambda content: None)
+        damage(content)
+        return Message(content, reply_to=message)
+
+    @outer.evaluate()
+    def evaluate(message: Message, context: Context) -> Message:
+        return inner(message, context)
+
+    return outer
+
+
+def change_arrays(change, *, honest: bool = True):
+    """Return a damage that changes the arrays, and the announced hash with them if it is to be `honest`."""
+
+    def damage(content: RecordDict) -> None:
+        arrays = change(wire.unpack_arrays(content[wire.ARRAYS]))
+        content[wire.ARRAYS] = wire.pack_arrays(arrays)
+        if honest:
+            content[wire.NOTE] = wire.note(sha256=digest(arrays))
+
+    return damage
+
+
+def change_first(change):
+    def of_all(arrays):
+        name = next(iter(arrays))
+        return {**arrays, name: change(arrays[name])}
+
+    return of_all
+
+
+def no_examples(content: RecordDict) -> None:
+    content[wire.METRICS] = MetricRecord({**content[wire.METRICS], wire.EXAMPLES: 0})
+
+
+def crash(content: RecordDict) -> None:
+    raise OSError("no space left on device")
+
+
+DAMAGE = {
+    "non-finite": change_arrays(change_first(lambda array: array * np.float32("nan"))),
+    "shape": change_arrays(change_first(lambda array: array.T.copy())),
+    "names": change_arrays(lambda arrays: {f"{name}_": array for name, array in arrays.items()}),
+    "hash": change_arrays(change_first(lambda array: array + np.float32(1)), honest=False),
+    "examples": no_examples,
+    "error": crash,
+}
+
+
+def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on(tiny):
+    config = replace(tiny, num_clients=7, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
+    tools = engine.remembering(clients.TOOLS)
+    app = damaging(dict(enumerate(DAMAGE.values())), tools)
+    root = engine.run_inline(config, clients_app=app, progress=False)
+
+    rejected = run_folder.read_metrics(root, "rejected").query("round == 1")
+    assert dict(zip(rejected.who, rejected.reason, strict=True)) == {f"client_{k}": r for k, r in enumerate(DAMAGE)}
+    assert "no space left on device" in rejected.detail.iloc[-1]
+    counts = run_folder.read_metrics(root, "replies").query("to == 'train'").iloc[0]
+    assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 6, 1)
+
+    store = tools.open_frames(config)
+    alone = clients.open_client(config, 6, tools)
+    pooled = data.pool_stats([data.episode_stats(store, share.train_ids) for share in clients.shares(store, config)])
+    bundle = model.load_policy(config, pooled)
+    alone.train(bundle, 1)
+    only_good = trainable_arrays(bundle.policy)
+    assert same({name: global_weights(root, 1)[name] for name in only_good}, only_good)
+
+
+def test_too_few_good_replies_stop_the_run_and_leave_what_there_is(tiny, tmp_path):
+    config = replace(tiny, min_replies=2, out=str(tmp_path), **NO_ROLLOUTS)
+    app = damaging({0: crash, 2: DAMAGE["hash"]}, engine.remembering(clients.TOOLS))
+    with pytest.raises(TooFewReplies, match="round 1: 1 of 3 training replies are good, min-replies=2 are required"):
+        engine.run_inline(config, clients_app=app, progress=False)
+    (root,) = tmp_path.iterdir()
+    assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")
+    assert global_weights(root, 0)
+    assert dict(run_folder.read_metrics(root, "rejected")[["who", "reason"]].values) == {
+        "client_0": "error",
+        "client_2": "hash",
+    }
+
+
+def test_a_client_that_cannot_introduce_itself_is_left_out(tiny):
+    config = replace(tiny, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
+    inner, outer = client_app.build(engine.remembering(clients.TOOLS)), ClientApp()
+
+    @outer.query()
+    def query(message, context):
+        if context.node_config["partition-id"] == 1:
+            raise data.DataError("episode 3 has a truncated video")
+        return inner(message, context)
+
+    outer.train()(lambda message, context: inner(message, context))
+    outer.evaluate()(lambda message, context: inner(message, context))
+    root = engine.run_inline(config, clients_app=outer, progress=False)
+    assert set(run_folder.read_metrics(root, "train").who) == {"client_0", "client_2"}
+    rejected = run_folder.read_metrics(root, "rejected").iloc[0]
+    assert (rejected.to, rejected.reason) == ("query", "error")
+    assert "truncated video" in rejected.detail
+
+
+def test_a_client_refuses_global_arrays_that_were_altered_on_the_way(tiny):
+    config = replace(tiny, **NO_ROLLOUTS)
+    client = clients.open_client(config, 0)
+    arrays = trainable_arrays(model.load_policy(config, client.statistics()).policy)
+    announced = digest(arrays)
+    arrays[next(iter(arrays))] += 1
+    instructions = {
+        wire.ROUND: 1,
+        wire.DIGEST: announced,
+        wire.STATS: wire.pack_stats(client.statistics()),
+    }
+    engine.claim_identity()
+    grid = engine.InlineGrid(client_app.build(), 1, engine.to_run_config(replace(config, num_clients=1)))
+    content = RecordDict({wire.ARRAYS: wire.pack_arrays(arrays), wire.CONFIG: ConfigRecord(instructions)})
+    (reply,) = grid.send_and_receive([Message(content, engine.FIRST_NODE_ID, "train")])
+    assert reply.has_error()
+    assert "SHA-256" in reply.error.reason
+
+
+def test_an_exception_surfaces_when_asked_for(tiny):
+    config = replace(tiny, num_server_rounds=1, **NO_ROLLOUTS)
+    app = damaging({1: crash}, engine.remembering(clients.TOOLS))
+    with pytest.raises(OSError, match="no space left"):
+        engine.run_inline(config, clients_app=app, progress=False, raise_errors=True)
+
+
+@pytest.mark.unit
+def test_a_partition_that_does_not_exist_is_refused_with_the_remedy(tiny):
+    with pytest.raises(ValueError, match="partition-id=3 is not one of num-clients=3 partitions"):
+        clients.open_client(tiny, 3)
+
+
+@pytest.mark.unit
+def test_rollouts_are_due_every_so_many_rounds_and_at_the_end():
+    config = from_profile("tiny", num_server_rounds=5)
+    due = {n: [r for r in range(6) if clients.rolls_out(replace(config, eval_every=n), r)] for n in (0, 2)}
+    assert due == {0: [5], 2: [0, 2, 4, 5]}
+
+
+@pytest.mark.unit
+def test_client_streams_differ():
+    seeds = {clients.client_seed(seed, k) for seed in range(5) for k in range(10)}
+    assert len(seeds) == 50

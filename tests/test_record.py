@@ -1,0 +1,193 @@
+"""A recording is a LeRobot data set at every moment, whatever interrupts it, and the same in the end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from fedvla_lib import record as recording_module
+from fedvla_lib.record import demonstrate, record
+from fedvla_lib.rollout import Episode
+from fedvla_lib.sim import So100Env
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, STATE_KEY, image_key
+from fedvla_lib.tasks import task_of
+
+SIZE = 32
+NUM_PUTS = 7  # files that publishing one episode moves into place: two videos, rows, metadata, and three shared ones
+
+
+def lerobot_opens(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("fedvla/test", root=root, video_backend="pyav")
+
+
+def made_up_episode(index: int, length: int = 5) -> Episode:
+    """Numbers and pictures that only depend on `index`."""
+    rng = np.random.default_rng(index)
+    return Episode(
+        task="lift",
+        instruction=f"Lift the {('red', 'green')[index % 2]} cube.",
+        color="red",
+        seed=index,
+        states=rng.normal(size=(length, 6)).astype(np.float32),
+        actions=rng.normal(size=(length, 6)).astype(np.float32),
+        images={camera: rng.integers(0, 255, (length, SIZE, SIZE, 3), dtype=np.uint8) for camera in CAMERAS},
+        success=True,
+    )
+
+
+def write(root: Path, until: int) -> None:
+    """Bring the made-up recording in `root` to `until` episodes."""
+    done = recording_module._num_recorded(root)
+    recorder = recording_module._Recorder(root, SIZE, done)
+    try:
+        for index in range(done, until):
+            recorder.add(made_up_episode(index))
+    finally:
+        recorder.close()
+
+
+def contents(root: Path) -> dict[str, object]:
+    """Everything a reader can see: tables as tables, the rest as bytes."""
+    paths = [path for part in ("meta", "data", "videos") for path in (root / part).rglob("*") if path.is_file()]
+    assert not [path for path in paths if path.name.startswith(".")], "half-written files are left over"
+    return {
+        str(path.relative_to(root)): pq.read_table(path) if path.suffix == ".parquet" else path.read_bytes()
+        for path in paths
+    }
+
+
+@pytest.mark.integration
+def test_lerobot_reads_back_what_the_expert_did(recording):
+    dataset = lerobot_opens(recording)
+    episode = demonstrate(So100Env("place", 64), index=1, seed=0)
+    rows = [dataset[i] for i in range(len(dataset)) if dataset.hf_dataset[i]["episode_index"] == 1]
+    assert len(rows) == episode.num_frames
+    assert dataset.fps == FPS
+    assert dataset.features[STATE_KEY]["names"] == list(JOINT_NAMES) == dataset.features[ACTION_KEY]["names"]
+    np.testing.assert_array_equal(np.stack([row[STATE_KEY] for row in rows]), episode.states)
+    np.testing.assert_array_equal(np.stack([row[ACTION_KEY] for row in rows]), episode.actions)
+    assert {row["task"] for row in rows} == {episode.instruction}
+    for camera in CAMERAS:
+        seen = np.stack([row[image_key(camera)].permute(1, 2, 0) for row in rows]) * 255
+        assert np.abs(seen - episode.images[camera]).mean() < 3, "H.264 costs a few grey levels, not more"
+
+
+@pytest.mark.integration
+def test_tasks_alternate_and_statistics_are_there(recording):
+    dataset = lerobot_opens(recording)
+    assert dataset.num_episodes == 12
+    tasks = [task_of(texts[0]) for texts in dataset.meta.episodes["tasks"]]
+    assert tasks == ["lift", "place", "push"] * 4
+    states = np.stack([row[STATE_KEY].numpy() for row in dataset.hf_dataset])
+    np.testing.assert_allclose(dataset.meta.stats[STATE_KEY]["mean"], states.mean(axis=0), rtol=1e-4, atol=1e-3)
+    assert dataset.meta.stats[STATE_KEY]["count"] == len(states)
+
+
+@pytest.mark.integration
+def test_the_same_command_on_a_complete_folder_changes_nothing(recording):
+    before = {path: path.stat().st_mtime_ns for path in recording.rglob("*")}
+    assert record(["lift", "place", "push"], 4, recording, image_size=64) == recording
+    assert {path: path.stat().st_mtime_ns for path in recording.rglob("*")} == before
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"tasks": ["place", "lift", "push"]}, "tasks="),
+        ({"image_size": 96}, "image_size=64, not 96"),
+        ({"seed": 1}, "seed=0, not 1"),
+        ({"episodes_per_task": 3}, "already holds 12 episodes"),
+    ],
+)
+def test_other_settings_on_an_existing_folder_are_refused(recording, change, reason):
+    settings = {"tasks": ["lift", "place", "push"], "episodes_per_task": 4, "image_size": 64, "seed": 0, **change}
+    with pytest.raises(ValueError, match=reason) as caught:
+        record(root=recording, **settings)
+    assert str(recording) in str(caught.value)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"tasks": ["juggle"]}, "unknown task 'juggle': choose one of lift, place, push"),
+        ({"tasks": []}, "at least one task"),
+        ({"episodes_per_task": 0}, "give 1 or more"),
+        ({"image_size": 33}, "image_size=33 is odd"),
+    ],
+)
+def test_unusable_requests_are_refused_before_anything_is_written(tmp_path, change, reason):
+    settings = {"tasks": ["lift"], "episodes_per_task": 1, "image_size": SIZE, **change}
+    with pytest.raises(ValueError, match=reason):
+        record(root=tmp_path / "new", **settings)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.unit
+def test_a_folder_with_other_files_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"thesis\.txt"):
+        record(["lift"], 1, tmp_path, image_size=SIZE)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.integration
+def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same_result(tmp_path, monkeypatch):
+    """Publishing moves several files per episode; stop before each of them in turn, during the second episode."""
+    write(tmp_path / "whole", 3)
+    move = recording_module._put
+    for survived in range(NUM_PUTS):
+        root, moved = tmp_path / f"died_after_{survived}", 0
+
+        def dying(source: Path, target: Path, survived: int = survived, root: Path = root) -> None:
+            nonlocal moved
+            if target.is_relative_to(root) and ".staging" not in target.parts:
+                if moved == NUM_PUTS + survived:
+                    raise KeyboardInterrupt
+                moved += 1
+            move(source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(recording_module, "_put", dying)
+            with pytest.raises(KeyboardInterrupt):
+                write(root, 3)
+        dataset = lerobot_opens(root)
+        assert dataset.num_episodes == 1 and len(dataset) == 5
+        assert dataset[4][image_key("front")].shape == (3, SIZE, SIZE)
+        write(root, 3)
+        assert contents(root) == contents(tmp_path / "whole")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
+def test_a_killed_recording_holds_complete_episodes_and_continues_to_the_same_result(tmp_path, name):
+    root, whole = tmp_path / "killed", tmp_path / "whole"
+    command = f"from fedvla_lib.record import record; record(['lift'], 50, {str(root)!r}, image_size={SIZE}, seed=3)"
+    process = subprocess.Popen([sys.executable, "-c", command], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 300
+    while recording_module._num_recorded(root) < 2 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, getattr(signal, name))
+    _, message = process.communicate(timeout=60)
+    done = recording_module._num_recorded(root)
+    dataset = lerobot_opens(root)
+    assert 2 <= done == dataset.num_episodes < 50
+    assert len(dataset) == sum(dataset.meta.episodes["length"])
+    assert dataset[len(dataset) - 1][image_key("overhead")].shape == (3, SIZE, SIZE)
+    if name == "SIGINT":
+        assert f"interrupted: {done} of 50 episodes are in {root}" in message
+        assert not (root / ".staging").exists()
+    record(["lift"], done + 1, root, image_size=SIZE, seed=3, progress=False)
+    record(["lift"], done + 1, whole, image_size=SIZE, seed=3, progress=False)
+    assert not (root / ".staging").exists()
+    assert contents(root) == contents(whole)
+    assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == done + 1

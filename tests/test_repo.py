@@ -1,0 +1,122 @@
+"""What must hold of the files themselves, whatever the code does."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+pytestmark = pytest.mark.unit
+ROOT = Path(__file__).parent.parent
+SUFFIXES = {".py", ".md", ".toml", ".yml", ".bib", ".ipynb", ".lock", ".css", ".svg", ""}
+# Written in halves, so that this file does not contain what it looks for.
+REGISTRY_HOSTS = ["pypi" + ".org", "pythonhosted" + ".org", "files." + "pypi", "index-" + "url", "deb." + "debian"]
+MACHINE_FOLDERS = ["ho" + "me", "ro" + "ot", "wo" + "rk", "Us" + "ers"]
+MACHINE_PATH = re.compile(rf"(?<![A-Za-z0-9_.$}}])/(?:{'|'.join(MACHINE_FOLDERS)})/")
+
+
+def tracked_files() -> list[Path]:
+    """Files that git tracks or would track, as text."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    return [ROOT / name for name in names if Path(name).suffix in SUFFIXES and (ROOT / name).is_file()]
+
+
+def pins() -> list[Requirement]:
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    return [Requirement(line.rstrip("\\ ")) for line in lines if "==" in line]
+
+
+def declared() -> list[Requirement]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [line for lines in project["optional-dependencies"].values() for line in lines]
+    return [Requirement(line) for line in project["dependencies"] + extras]
+
+
+def test_no_registry_host_and_no_machine_path():
+    found = []
+    for path in tracked_files():
+        text = path.read_text(encoding="utf-8")
+        found += [f"{path.relative_to(ROOT)}: {host}" for host in REGISTRY_HOSTS if host in text]
+        found += [f"{path.relative_to(ROOT)}: {match[0]}" for match in MACHINE_PATH.finditer(text)]
+    assert not found
+
+
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-uv.lock"])
+def test_every_pin_has_hashes(name):
+    blocks = re.split(r"^(?=[a-z0-9])", (ROOT / name).read_text(), flags=re.MULTILINE)[1:]
+    assert blocks
+    bare = [block.split()[0] for block in blocks if "--hash=sha256:" not in block]
+    assert not bare
+
+
+def test_lock_satisfies_the_declared_ranges():
+    versions = {}
+    for pin in pins():
+        versions.setdefault(canonicalize_name(pin.name), []).append(str(next(iter(pin.specifier)).version))
+    for wanted in declared():
+        locked = versions.get(canonicalize_name(wanted.name), [])
+        assert locked, f"{wanted} is not in requirements.lock: run make lock"
+        assert all(wanted.specifier.contains(version) for version in locked), f"{wanted}: locked is {locked}"
+
+
+def test_readme_commands_exist():
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    for page in ["README.md", *(f"book/{name}.md" for name in ("index", "setup", "how_to_read"))]:
+        used = set(re.findall(r"(?:^|[`\s])make ([a-z]+)", code_of(page), flags=re.MULTILINE))
+        assert used <= targets, f"{page} names {sorted(used - targets)}"
+
+
+def code_of(page: str) -> str:
+    """Text in code blocks and in backticks."""
+    text = (ROOT / page).read_text()
+    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+    return "\n".join([*blocks, *re.findall(r"`([^`\n]+)`", text)])
+
+
+def test_readme_lists_every_module():
+    text = (ROOT / "README.md").read_text()
+    modules = [path.name for path in (ROOT / "fedvla_lib").glob("*.py") if path.name != "__init__.py"]
+    assert not [name for name in modules if name not in text]
+
+
+def test_bibliography_holds_what_is_cited_and_nothing_else():
+    entries = set(re.findall(r"^@\w+\{([^,]+),", (ROOT / "book" / "references.bib").read_text(), flags=re.MULTILINE))
+    texts = [path.read_text() for path in [*(ROOT / "book").glob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")]]
+    lists = [names for text in texts for names in re.findall(r"\{cite(?::\w+)?\}`([^`]+)`", text)]
+    cited = {name.strip() for names in lists for name in names.split(",")}
+    assert cited == entries
+
+
+def test_licence_is_whole():
+    text = (ROOT / "LICENSE").read_text()
+    assert "Apache License" in text and "END OF TERMS AND CONDITIONS" in text
+
+
+FENCES = {  # a heavy package and the modules that may import it
+    "mujoco": {"sim", "expert", "scene"},
+    "mink": {"expert"},
+    "matplotlib": {"plots"},
+    "statsmodels": {"compare"},
+}
+
+
+@pytest.mark.parametrize("package", FENCES)
+def test_heavy_packages_stay_behind_their_fence(package):
+    pattern = re.compile(rf"^\s*(?:import|from) {package}\b", flags=re.MULTILINE)
+    importers = {path.stem for path in (ROOT / "fedvla_lib").glob("*.py") if pattern.search(path.read_text())}
+    assert importers <= FENCES[package] | {"doctor"}
+
+
+def test_nothing_in_the_library_imports_the_apps_but_the_engine():
+    pattern = re.compile(r"\b(client_app|server_app)\b")
+    importers = {
+        path.stem
+        for path in (ROOT / "fedvla_lib").glob("*.py")
+        for line in path.read_text().splitlines()
+        if line.strip().startswith(("import ", "from ")) and pattern.search(line)
+    }
+    assert importers <= {"engine"}

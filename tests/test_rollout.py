@@ -1,0 +1,83 @@
+"""One loop for recording and evaluation: what it returns is what the actor saw and did."""
+
+import numpy as np
+import pytest
+
+from fedvla_lib.expert import Expert
+from fedvla_lib.rollout import run_episode
+from fedvla_lib.sim import HOME, So100Env
+from fedvla_lib.spec import CAMERAS, FPS
+
+pytestmark = pytest.mark.integration
+SIZE = 32
+
+
+class Stubborn:
+    """An actor that wants one posture, and remembers what it was shown."""
+
+    def __init__(self, target):
+        self.target = target
+
+    def reset(self, env, seed):
+        self.seed, self.seen = seed, []
+
+    def act(self, observation):
+        self.seen.append(observation)
+        return self.target
+
+
+@pytest.fixture(scope="module")
+def env():
+    return So100Env("lift", image_size=SIZE)
+
+
+def test_episode_holds_what_the_actor_saw_when_it_acted(env):
+    actor = Stubborn(HOME)
+    episode = run_episode(env, actor, seed=7)
+    assert actor.seed == episode.seed == 7
+    assert episode.num_frames == len(actor.seen) == 80  # the horizon: this actor never succeeds
+    assert episode.duration_s == 80 / FPS
+    assert not episode.success
+    for time in (0, 40, 79):
+        np.testing.assert_array_equal(episode.states[time], actor.seen[time]["agent_pos"])
+        for camera in CAMERAS:
+            np.testing.assert_array_equal(episode.images[camera][time], actor.seen[time]["pixels"][camera])
+
+
+def test_episode_types_and_words(env):
+    episode = run_episode(env, Expert(), seed=1)
+    frames = episode.num_frames
+    assert episode.success
+    assert episode.states.dtype == episode.actions.dtype == np.float32
+    assert episode.states.shape == episode.actions.shape == (frames, 6)
+    assert {camera: image.shape for camera, image in episode.images.items()} == dict.fromkeys(
+        CAMERAS, (frames, SIZE, SIZE, 3)
+    )
+    assert episode.task == "lift"
+    assert episode.instruction == f"Lift the {episode.color} cube."
+
+
+def test_same_seed_same_episode_with_or_without_pictures(env):
+    one, again = run_episode(env, Expert(), seed=3), run_episode(env, Expert(), seed=3)
+    unseen = run_episode(So100Env("lift", cameras=(), render_mode=None), Expert(), seed=3)
+    for other in (again, unseen):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.actions, other.actions)
+    np.testing.assert_array_equal(one.images["front"], again.images["front"])
+    assert unseen.images == {}
+
+
+def test_replaying_the_actions_repeats_the_episode(env):
+    """A recording is complete: seed and actions are enough to see it again."""
+    episode = run_episode(env, Expert(), seed=5)
+    observation, _ = env.reset(seed=5)
+    for state, action in zip(episode.states, episode.actions, strict=True):
+        np.testing.assert_array_equal(observation["agent_pos"], state)
+        observation, _, terminated, _, info = env.step(action)
+    assert terminated and info["is_success"]
+
+
+@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(5)])
+def test_an_actor_that_breaks_the_contract_is_stopped(env, target):
+    with pytest.raises(ValueError, match="action"):
+        run_episode(env, Stubborn(target), seed=0)

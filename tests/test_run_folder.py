@@ -1,0 +1,100 @@
+"""A run on disk is never overwritten, survives a crash, and reads back as tables."""
+
+import json
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from fedvla_lib import run_folder
+from fedvla_lib.config import Config, from_profile
+
+pytestmark = pytest.mark.unit
+
+
+def make(config: Config):
+    with run_folder.start(config, engine="inline") as run:
+        return run.root
+
+
+def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
+    config = from_profile("tiny", out=str(tmp_path / "outputs"))
+    with ThreadPoolExecutor(4) as pool:
+        roots = list(pool.map(make, [config] * 8))
+    assert len(set(roots)) == 8
+    assert all(re.fullmatch(r"\d{8}_\d{6}", root.name) for root in roots)
+
+
+def test_settings_and_stamp_read_back(tmp_path):
+    config = from_profile("tiny", out=str(tmp_path), lr=3e-4, seed=7)
+    began = time.time()
+    root = make(config)
+    assert run_folder.read_config(root) == config
+    stamp = run_folder.read_stamp(root)
+    assert stamp["status"] == "completed"
+    assert 0 <= stamp["wall_s"] <= time.time() - began + 1
+    assert stamp["hardware"]["cores"] >= 1
+    assert stamp["versions"]["lerobot"]
+
+
+def test_the_hash_follows_what_is_computed_not_where():
+    config = from_profile("tiny")
+    assert run_folder.config_hash(config) == run_folder.config_hash(from_profile("tiny", out="elsewhere", num_threads=3))
+    assert run_folder.config_hash(config) != run_folder.config_hash(from_profile("tiny", seed=1))
+
+
+def test_events_become_columns(tmp_path):
+    with run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
+        run.log(0, "global", "evaluate", {"loss": np.float32(2.0), "success_rate": 0.5})
+        run.log(1, "client_0", "train", {"loss": 1.0, "num_examples": np.int64(12)})
+        run.log(1, "client_1", "rollout", {"success": np.bool_(False), "completion_time_s": float("nan"), "round": 99})
+    table = run_folder.read_metrics(run.root)
+    assert table["round"].tolist() == [0, 1, 1]
+    assert table.loss.tolist()[:2] == [2.0, 1.0]
+    only = run_folder.read_metrics(run.root, "train")
+    assert list(only.columns) == ["round", "who", "kind", "time", "loss", "num_examples"]
+    assert run_folder.read_metrics(run.root, "nothing").empty
+    for line in (run.root / "metrics.jsonl").read_text().splitlines():
+        json.loads(line, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+def test_a_line_cut_off_by_a_crash_is_left_out_and_a_broken_one_is_named(tmp_path):
+    with run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
+        run.log(1, "global", "evaluate", {"loss": 1.0})
+    path = run.root / "metrics.jsonl"
+    whole = path.read_text()
+    path.write_text(whole + '{"round": 2, "who": "glo')
+    assert len(run_folder.read_metrics(run.root)) == 1
+    path.write_text('{"round": 2, "who": "glo\n' + whole)
+    with pytest.raises(ValueError, match="metrics.jsonl line 1 is not an event"):
+        run_folder.read_metrics(run.root)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(RuntimeError("no clients"), "failed: RuntimeError: no clients"), (KeyboardInterrupt(), "interrupted")],
+)
+def test_the_stamp_tells_how_a_run_ended(tmp_path, error, status):
+    with pytest.raises(type(error)), run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
+        assert run_folder.read_stamp(run.root)["status"] == "running"
+        raise error
+    assert run_folder.read_stamp(run.root)["status"] == status
+
+
+def test_an_unwritable_place_is_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ValueError, match="cannot make the run folder .*file.*give a writable folder"):
+        make(from_profile("tiny", out=str(tmp_path / "file")))
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path):
+    with pytest.raises(ValueError, match="is not a run folder"):
+        run_folder.read_metrics(tmp_path)
+
+
+def test_atomic_writes_leave_no_scratch_files(tmp_path):
+    run_folder.write_json(tmp_path / "a.json", {"x": [np.float64(1), float("inf")]})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": [1.0, None]}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

@@ -1,0 +1,420 @@
+"""The simulated arm: Gymnasium's contract, determinism, units, honest success predicates, and a renderer that lasts."""
+
+import gc
+import multiprocessing
+import os
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from fedvla_lib.scene import decimated_meshes
+from fedvla_lib.sim import ENV_ID, HOME, So100Env, from_radians, to_radians
+from fedvla_lib.spec import CAMERAS, NUM_JOINTS
+from fedvla_lib.tasks import (
+    AWAY_M,
+    COLORS,
+    LIFT_CLEARANCE_M,
+    PLACE_HALF_M,
+    PUSH_RADIUS_M,
+    TASKS,
+    Scene,
+    check_tasks,
+    draw_layout,
+    instruction,
+    task_of,
+)
+
+pytestmark = pytest.mark.unit
+SIZE = 32
+
+
+@pytest.fixture(params=sorted(TASKS))
+def task(request):
+    return request.param
+
+
+def blind(task: str) -> So100Env:
+    return So100Env(task, cameras=(), render_mode=None)
+
+
+def wander(env: So100Env, seed: int, steps: int = 12) -> list[np.ndarray]:
+    """Everything observed under random targets near the start."""
+    rng = np.random.default_rng(1)
+    observation, _ = env.reset(seed=seed)
+    seen = [observation]
+    for _ in range(steps):
+        seen.append(env.step(observation["agent_pos"] + rng.uniform(-15, 15, NUM_JOINTS))[0])
+    return [np.stack([frame["agent_pos"] for frame in seen])] + [
+        np.stack([frame["pixels"][camera] for frame in seen]) for camera in CAMERAS
+    ]
+
+
+def wait(env: So100Env, steps: int = 60) -> bool:
+    """Hold the arm where it is; whether the task counted as fulfilled meanwhile."""
+    target = env.joints
+    for _ in range(steps):
+        *_, terminated, truncated, _ = env.step(target)
+        if terminated or truncated:
+            return terminated
+    return False
+
+
+def set_cube(env: So100Env, xyz_m, velocity_mps=(0.0, 0.0, 0.0)) -> None:
+    env.data.joint("cube").qpos[:3] = xyz_m
+    env.data.joint("cube").qvel[:3] = velocity_mps
+
+
+# --- Gymnasium's contract
+
+
+def test_gymnasium_accepts_the_environment(task):
+    check_env(So100Env(task, image_size=SIZE), skip_render_check=False)
+
+
+def test_registered_with_gymnasium():
+    env = gymnasium.make(ENV_ID, task="push", image_size=SIZE)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert env.unwrapped.task == "push"
+    env.close()
+
+
+def test_truncates_at_the_horizon_and_then_asks_for_a_reset(task):
+    env = blind(task)
+    env.reset(seed=0)
+    flags = [env.step(HOME)[2:4] for _ in range(TASKS[task].horizon_steps)]
+    assert not any(terminated for terminated, _ in flags)
+    assert [truncated for _, truncated in flags] == [False] * (len(flags) - 1) + [True]
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(HOME)
+
+
+def test_without_cameras_there_are_no_pixels_and_the_same_motion():
+    seeing, unseeing = So100Env("lift", image_size=SIZE), blind("lift")
+    assert "pixels" not in unseeing.reset(seed=3)[0]
+    seeing.reset(seed=3)
+    for _ in range(5):
+        np.testing.assert_array_equal(seeing.step(HOME)[0]["agent_pos"], unseeing.step(HOME)[0]["agent_pos"])
+    assert unseeing.render() is None
+
+
+# --- determinism and chance
+
+
+def test_same_seed_same_trajectory_and_pixels(task):
+    env = So100Env(task, image_size=SIZE)
+    first = wander(env, seed=5)
+    wander(env, seed=6)  # what came before must not matter
+    for again in (wander(env, seed=5), wander(So100Env(task, image_size=SIZE), seed=5)):
+        for one, other in zip(first, again, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_different_seeds_differ(task):
+    env = So100Env(task, image_size=SIZE)
+    for one, other in zip(wander(env, seed=5), wander(env, seed=6), strict=True):
+        assert not np.array_equal(one, other)
+
+
+def test_color_changes_the_words_and_the_picture_but_not_the_layout(task):
+    env = So100Env(task, image_size=SIZE)
+    layouts, pictures = [], []
+    for color in COLORS:
+        observation, _ = env.reset(seed=2, options={"color": color})
+        assert env.instruction == env.task_description == instruction(task, color)
+        layouts.append((env.layout.cube_xy_m, env.layout.cube_yaw_rad, env.layout.zone_xy_m))
+        pictures.append(observation["pixels"]["front"])
+    assert len(set(layouts)) == 1
+    assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_layouts_stay_in_their_regions_and_use_every_color(task):
+    rng = np.random.default_rng(0)
+    layouts = [draw_layout(TASKS[task], rng) for _ in range(200)]
+    radii = np.array([np.hypot(*layout.cube_xy_m) for layout in layouts])
+    low, high = TASKS[task].cube.radius_m
+    assert low <= radii.min() < radii.max() <= high
+    assert {layout.color for layout in layouts} == set(COLORS)
+    assert all((layout.zone_xy_m is not None) == (TASKS[task].zone is not None) for layout in layouts)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_each_camera_shows_where_the_cube_is(camera):
+    """The centre of the cube's pixels moves with the cube, in both directions of the table."""
+    env = So100Env("lift", image_size=96)
+    env.reset(seed=0, options={"color": "blue"})
+    centres = []
+    for xy in ((0.18, -0.1), (0.18, 0.1), (0.23, -0.1)):
+        set_cube(env, (*xy, 0.014))
+        pixels = env.step(HOME)[0]["pixels"][camera].astype(int)
+        blue = np.argwhere((pixels[..., 2] > 100) & (pixels[..., 2] - pixels[..., 0] > 60))
+        assert len(blue) >= 15
+        centres.append(blue.mean(axis=0))
+    assert abs(centres[1][1] - centres[0][1]) > 20  # left or right
+    assert abs(centres[2][0] - centres[0][0]) > 3  # near or far
+
+
+def test_zone_is_drawn_where_the_task_has_one():
+    for name, wanted in (("place", (True, True, False)), ("push", (True, True, True))):
+        env = So100Env(name, image_size=96)
+        pixels = env.reset(seed=0, options={"color": "blue"})[0]["pixels"]
+        for camera in CAMERAS:
+            bright = (pixels[camera][48:] > 200) == np.array(wanted)
+            assert bright.all(axis=-1).sum() > 40, (name, camera)
+
+
+# --- units and memory
+
+
+def test_units_round_trip():
+    env = blind("lift")
+    limits = env.model.jnt_range[:NUM_JOINTS]
+    for _ in range(20):
+        joints = env.action_space.sample()
+        np.testing.assert_allclose(from_radians(to_radians(joints, limits), limits), joints, atol=1e-4)
+    np.testing.assert_allclose(from_radians(limits[:, 0], limits)[-1], 0)
+    np.testing.assert_allclose(from_radians(limits[:, 1], limits)[-1], 100)
+
+
+def test_positive_degrees_turn_as_documented():
+    env = blind("lift")
+    env.reset(seed=0)
+
+    def grasp_m(**degrees: float) -> np.ndarray:
+        joints = np.zeros(NUM_JOINTS)
+        joints[["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex"].index(*degrees)] = [*degrees.values()][0]
+        env.step(joints)
+        for _ in range(15):
+            env.step(joints)
+        return env.data.site("grasp").xpos.copy()
+
+    zero = grasp_m(shoulder_pan=0)
+    assert zero[0] > 0.3 and abs(zero[1]) < 0.02  # straight ahead, stretched
+    assert grasp_m(shoulder_pan=20)[1] > zero[1] + 0.1
+    assert grasp_m(shoulder_lift=10)[0] > zero[0]
+    assert grasp_m(elbow_flex=10)[2] < zero[2] - 0.03
+    assert grasp_m(wrist_flex=10)[2] < zero[2] - 0.01
+
+
+def test_arm_reaches_its_targets_and_clips_those_out_of_range():
+    env = blind("lift")
+    env.reset(seed=0)
+    target = HOME + np.array([10, 5, -5, 5, 20, 10])
+    for _ in range(15):
+        env.step(target)
+    np.testing.assert_allclose(env.joints, target, atol=0.6)
+    for _ in range(15):
+        env.step(np.where(np.arange(NUM_JOINTS) == 5, 1e4, target))
+    assert env.joints[5] == pytest.approx(100, abs=2)
+
+
+def test_observations_share_no_memory_with_the_simulation():
+    env = So100Env("lift", image_size=SIZE)
+    observation, _ = env.reset(seed=0)
+    kept = {"agent_pos": observation["agent_pos"].copy(), **{c: i.copy() for c, i in observation["pixels"].items()}}
+    later, *_ = env.step(HOME + 20)
+    np.testing.assert_array_equal(observation["agent_pos"], kept["agent_pos"])
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(observation["pixels"][camera], kept[camera])
+        assert not np.shares_memory(observation["pixels"][camera], later["pixels"][camera])
+    before = env.joints
+    later["agent_pos"][:] = 0
+    np.testing.assert_array_equal(env.joints, before)
+
+
+# --- success means success
+
+
+def scene(**changes) -> Scene:
+    """A cube at rest on the zone's centre, nothing near it."""
+    calm = dict(clearance_m=0.0, peak_clearance_m=0.0, speed_mps=0.0, zone_offset_m=(0.0, 0.0), held=False,
+                touched=False, carried=False, flung=False, hand_distance_m=0.1)  # fmt: skip
+    return Scene(**{**calm, **changes})
+
+
+LIFTED = dict(clearance_m=LIFT_CLEARANCE_M + 0.01, held=True, touched=True)
+PLACED = dict(carried=True, peak_clearance_m=0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "spoilers"),
+    [
+        ("lift", LIFTED, [dict(held=False), dict(clearance_m=LIFT_CLEARANCE_M - 0.01)]),
+        (
+            "place",
+            PLACED,
+            [
+                dict(carried=False),
+                dict(touched=True),
+                dict(hand_distance_m=AWAY_M - 0.01),
+                dict(speed_mps=0.1),
+                dict(clearance_m=0.02),
+                dict(zone_offset_m=(PLACE_HALF_M, 0.0)),
+                dict(zone_offset_m=(0.0, -PLACE_HALF_M)),
+            ],
+        ),
+        (
+            "push",
+            dict(touched=True),
+            [
+                dict(carried=True),
+                dict(flung=True),
+                dict(peak_clearance_m=0.03),
+                dict(speed_mps=0.1),
+                dict(clearance_m=0.02),
+                dict(zone_offset_m=(PUSH_RADIUS_M, 0.0)),
+            ],
+        ),
+    ],
+)
+def test_every_condition_of_a_predicate_matters(name, good, spoilers):
+    success = TASKS[name].success
+    assert success(scene(**good))
+    for spoiler in spoilers:
+        assert not success(scene(**{**good, **spoiler})), spoiler
+
+
+def test_a_tossed_cube_is_not_lifted():
+    env = blind("lift")
+    env.reset(seed=0)
+    for speed_mps in (1.0, 2.0, 3.0):
+        set_cube(env, env.cube_m, (0.0, 0.0, speed_mps))
+        assert not wait(env, steps=20)
+        assert env._peak_clearance_m > LIFT_CLEARANCE_M
+
+
+def test_a_cube_knocked_into_the_circle_is_not_pushed():
+    env = blind("push")
+    env.reset(seed=3)
+    way_m = np.subtract(env.layout.zone_xy_m, env.cube_m[:2])
+    set_cube(env, env.cube_m, (*(1.5 * way_m / np.linalg.norm(way_m)), 0.0))
+    assert not wait(env)
+    assert np.linalg.norm(env.cube_m[:2] - env.layout.zone_xy_m) < PUSH_RADIUS_M - 0.02  # and yet it lies inside
+
+
+def test_a_cube_that_was_never_carried_is_not_placed():
+    env = blind("place")
+    env.reset(seed=0)
+    set_cube(env, (*env.layout.zone_xy_m, 0.014))
+    assert not wait(env)
+
+
+def test_an_idle_arm_fulfils_nothing(task):
+    env = blind(task)
+    for seed in range(3):
+        env.reset(seed=seed)
+        assert not wait(env, steps=TASKS[task].horizon_steps)
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (dict(task="juggle"), "lift, place, push"),
+        (dict(image_size=8), "16 to 1024"),
+        (dict(image_size=96.5), "whole number"),
+        (dict(cameras=("wrist",)), "overhead, front"),
+        (dict(render_mode="human"), "rgb_array"),
+    ],
+)
+def test_bad_arguments_are_named_with_the_valid_ones(arguments, names):
+    with pytest.raises(ValueError, match=names):
+        So100Env(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("action", "named"),
+    [(np.zeros(7), r"\(7,\)"), (np.zeros((1, 6)), r"\(1, 6\)"), (np.append(np.zeros(5), np.nan), "gripper is nan")],
+)
+def test_bad_actions_are_named(action, named):
+    env = blind("lift")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=named):
+        env.step(action)
+
+
+def test_bad_colors_and_tasks_are_named():
+    with pytest.raises(ValueError, match="red, green, blue"):
+        blind("lift").reset(seed=0, options={"color": "mauve"})
+    with pytest.raises(ValueError, match="lift, place, push"):
+        check_tasks(["lift", "stack"])
+    with pytest.raises(ValueError, match="red, green, blue"):
+        instruction("lift", "mauve")
+
+
+# --- words
+
+
+def test_instructions_lead_back_to_their_task():
+    for name in TASKS:
+        for color in COLORS:
+            assert task_of(instruction(name, color)) == name
+    assert task_of("Fold the towel.") == "Fold the towel."
+
+
+# --- drawing
+
+
+def test_frames_survive_the_end_of_another_environment():
+    """Under EGL, freeing one of MuJoCo's renderers can delete another one's buffers."""
+    env = So100Env("lift", image_size=SIZE)
+    env.reset(seed=0)
+    before = env.render()
+    others = [So100Env("place", image_size=SIZE) for _ in range(2)]
+    for other in others:
+        other.reset(seed=1)
+    others.pop().close()
+    np.testing.assert_array_equal(env.render(), before)
+    del other
+    others.clear()
+    gc.collect()
+    np.testing.assert_array_equal(env.render(), before)
+    env.close()
+    np.testing.assert_array_equal(env.render(), before)  # and closing is not the end
+
+
+def test_pictures_are_not_blank():
+    env = So100Env("lift", image_size=SIZE)
+    env.reset(seed=0)
+    for half in np.hsplit(env.render(), 2):
+        assert half.std() > 20
+
+
+@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
+def test_a_fresh_process_draws_without_being_told_how_and_exits_quietly():
+    code = "from fedvla_lib.sim import So100Env; print(*So100Env(image_size=16).reset(seed=0)[0]['pixels'])"
+    untold = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=untold)
+    assert (done.returncode, done.stdout.split()) == (0, list(CAMERAS)), done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
+@pytest.mark.parametrize(("driver", "first"), [("off", "numpy"), ("", "mujoco")])
+def test_drawing_that_cannot_work_says_what_to_set(driver, first):
+    code = f"import {first}; from fedvla_lib.sim import So100Env; So100Env(image_size=16).reset(seed=0)"
+    mute = {**os.environ, "MUJOCO_GL": driver}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=mute)
+    message = done.stderr.strip().splitlines()[-1]
+    assert message.startswith(f"RuntimeError: cannot draw off screen with MUJOCO_GL={driver!r}"), done.stderr
+    assert "set MUJOCO_GL to egl, osmesa or glfw before mujoco is first imported" in message
+
+
+def test_settings_and_specification_do_not_load_the_simulator():
+    code = "import sys, fedvla_lib.config, fedvla_lib.spec, fedvla_lib.tasks; sys.exit('mujoco' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+def test_two_processes_may_make_the_mesh_cache_at_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("FEDVLA_CACHE", str(tmp_path))
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        folders = pool.starmap(decimated_meshes, [()] * 2, chunksize=1)
+    assert folders[0] == folders[1]
+    assert [path.name for path in tmp_path.iterdir()] == [folders[0].name]  # no drafts left behind
+    assert len(list(folders[0].glob("*.stl"))) >= 18

@@ -1,0 +1,283 @@
+"""Averaging and its checks, with Flower's own messages and apps on small arrays: no robot policy is needed here."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.clientapp import ClientApp
+
+from fedvla_lib import wire
+from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
+from fedvla_lib.params import digest, shapes_of
+from fedvla_lib.roster import Roster, TooFewReplies, call, wait_for_nodes
+from fedvla_lib.strategies import CheckedFedAvg
+
+pytestmark = pytest.mark.unit
+SHAPES = {"weight": (5, 3), "bias": (3,), "gain": ()}
+
+
+@pytest.fixture(autouse=True)
+def identity():
+    claim_identity()
+
+
+def random_arrays(seed, scale=1.0):
+    rng = np.random.default_rng(seed)
+    return {name: np.asarray(scale * rng.normal(size=shape), np.float32) for name, shape in SHAPES.items()}
+
+
+def reply_content(arrays, examples=10, loss=1.0):
+    return {
+        wire.ARRAYS: wire.pack_arrays(arrays),
+        wire.METRICS: MetricRecord({wire.EXAMPLES: examples, "loss": loss, "seconds": 0.1}),
+        wire.NOTE: wire.note(sha256=digest(arrays)),
+    }
+
+
+def answering(content_of) -> ClientApp:
+    """A ClientApp whose training reply is whatever `content_of(partition_id, global arrays)` returns."""
+    app = ClientApp()
+
+    @app.train()
+    def train(message: Message, context: Context) -> Message:
+        arrays = wire.unpack_arrays(message.content[wire.ARRAYS])
+        content = content_of(context.node_config["partition-id"], arrays)
+        return Message(RecordDict(content), reply_to=message)
+
+    return app
+
+
+class Events(list):
+    """Collects what a run folder would write."""
+
+    def log(self, round_number, who, kind, values):
+        self.append((round_number, who, kind, values))
+
+    def rejected(self):
+        return {who: values["reason"] for _, who, kind, values in self if kind == "rejected"}
+
+
+def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, **options):
+    """Return the aggregated arrays, the metrics and the events of one training round."""
+    events = Events()
+    grid = InlineGrid(app, num_clients, {})
+    roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
+    strategy = CheckedFedAvg(
+        roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None, **options
+    )
+    start = start or random_arrays(99)
+    messages = strategy.configure_train(server_round, wire.pack_arrays(start), ConfigRecord(), grid)
+    replies = grid.send_and_receive(messages)
+    replies = replies[::-1] if reverse else replies
+    arrays, metrics = strategy.aggregate_train(server_round, replies)
+    return wire.unpack_arrays(arrays), metrics, events
+
+
+def test_aggregation_equals_a_float64_reference():
+    examples = [7, 120, 33, 1, 64, 5, 900, 18, 2, 51]
+    updates = [random_arrays(k, scale=3.0) for k in range(10)]
+    app = answering(lambda k, _: reply_content(updates[k], examples[k]))
+    averaged, _, _ = one_round(app, 10)
+    for name in SHAPES:
+        stacked = np.stack([update[name].astype(np.float64) for update in updates])
+        expected = np.average(stacked, axis=0, weights=examples)
+        np.testing.assert_allclose(averaged[name], expected, atol=1e-6, rtol=1e-6)
+        assert averaged[name].dtype == np.float32
+        assert averaged[name].shape == SHAPES[name]
+
+
+@pytest.mark.parametrize("num_clients", [1, 2, 3, 10])
+def test_equal_clients_average_to_themselves(num_clients):
+    same = random_arrays(5)
+    averaged, _, _ = one_round(answering(lambda k, _: reply_content(same, 10 + k)), num_clients)
+    for name in SHAPES:
+        np.testing.assert_allclose(averaged[name], same[name], rtol=1e-6)
+
+
+def test_one_client_is_not_changed_at_all():
+    update = random_arrays(5)
+    averaged, _, _ = one_round(answering(lambda k, _: reply_content(update, 123)), 1)
+    assert digest(averaged) == digest(update)
+
+
+def test_the_result_does_not_depend_on_who_answers_first():
+    app = answering(lambda k, _: reply_content(random_arrays(k), 3 + 7 * k))
+    forward, forward_metrics, _ = one_round(app, 10)
+    backward, backward_metrics, _ = one_round(app, 10, reverse=True)
+    assert digest(forward) == digest(backward)
+    assert dict(forward_metrics) == dict(backward_metrics)
+
+
+def test_metrics_are_averaged_by_examples():
+    app = answering(lambda k, _: reply_content(random_arrays(k), [30, 10][k], loss=[1.0, 5.0][k]))
+    _, metrics, events = one_round(app, 2)
+    assert metrics["loss"] == pytest.approx((30 * 1.0 + 10 * 5.0) / 40)
+    assert [(who, values["num_examples"]) for _, who, kind, values in events if kind == "train"] == [
+        ("client_0", 30),
+        ("client_1", 10),
+    ]
+
+
+def _without(content, key):
+    return {name: record for name, record in content.items() if name != key}
+
+
+def _nan(arrays):
+    return {**arrays, "bias": np.full(3, np.nan, np.float32)}
+
+
+def _raise():
+    raise RuntimeError("disk on fire")
+
+
+GOOD = random_arrays(1)
+UNDECODABLE = ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array("float32", (3,), "numpy.ndarray", b"not an array")})
+FAULTS = {
+    "nan": ("non-finite", lambda: reply_content(_nan(GOOD))),
+    "wrong shape": ("shape", lambda: reply_content({**GOOD, "bias": np.zeros(4, np.float32)})),
+    "renamed array": ("names", lambda: reply_content({("W" if n == "weight" else n): a for n, a in GOOD.items()})),
+    "missing array": ("names", lambda: reply_content(_without(GOOD, "gain"))),
+    "wrong dtype": ("dtype", lambda: reply_content({n: a.astype(np.float64) for n, a in GOOD.items()})),
+    "undecodable bytes": ("dtype", lambda: {**reply_content(GOOD), wire.ARRAYS: UNDECODABLE}),
+    "wrong hash": ("hash", lambda: {**reply_content(GOOD), wire.NOTE: wire.note(sha256=hashlib.sha256().hexdigest())}),
+    "no hash": ("hash", lambda: _without(reply_content(GOOD), wire.NOTE)),
+    "no arrays": ("names", lambda: _without(reply_content(GOOD), wire.ARRAYS)),
+    "no metrics": ("metrics", lambda: _without(reply_content(GOOD), wire.METRICS)),
+    "zero examples": ("examples", lambda: reply_content(GOOD, examples=0)),
+    "negative examples": ("examples", lambda: reply_content(GOOD, examples=-5)),
+    "infinite loss": ("metrics", lambda: reply_content(GOOD, loss=float("inf"))),
+    "extra metric": (
+        "metrics",
+        lambda: {**reply_content(GOOD), wire.METRICS: MetricRecord({wire.EXAMPLES: 1, "loss": 1.0, "vote": 9.0})},
+    ),
+    "exception": ("error", _raise),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault):
+    reason, bad = FAULTS[fault]
+    app = answering(lambda k, _: bad() if k == 1 else reply_content(random_arrays(k)))
+    averaged, _, events = one_round(app, 3, min_replies=2)
+    assert events.rejected() == {"client_1": reason}
+    counted = next(values for _, _, kind, values in events if kind == "replies")
+    assert (counted["good"], counted["rejected"], counted[f"rejected_{reason}"]) == (2, 1, 1)
+    for name in SHAPES:
+        expected = (random_arrays(0)[name] + random_arrays(2)[name]) / 2
+        np.testing.assert_allclose(averaged[name], expected, rtol=1e-6, atol=1e-7)
+
+
+def test_the_reason_of_an_exception_reaches_the_events():
+    app = answering(lambda k, _: _raise() if k == 0 else reply_content(random_arrays(k)))
+    _, _, events = one_round(app, 2)
+    detail = next(values["detail"] for _, _, kind, values in events if kind == "rejected")
+    assert "disk on fire" in detail and "\n" not in detail
+
+
+def test_a_client_that_never_answers_is_reported():
+    events = Events()
+    grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
+    roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
+    strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None)
+    messages = strategy.configure_train(1, wire.pack_arrays(GOOD), ConfigRecord(), grid)
+    strategy.aggregate_train(1, grid.send_and_receive(messages)[:1])
+    assert events.rejected() == {"client_1": "silent"}
+
+
+def test_too_few_good_replies_stop_the_run_in_clear_words():
+    app = answering(lambda k, _: reply_content(_nan(GOOD)) if k else reply_content(GOOD))
+    with pytest.raises(TooFewReplies, match="round 4: 1 of 3 training replies are good, min-replies=2"):
+        one_round(app, 3, min_replies=2, server_round=4)
+
+
+def test_clients_are_drawn_from_the_seed_by_partition_not_by_node():
+    rng = np.random.default_rng
+    mirrored = Roster({1000 - k: k for k in range(20)})
+    shifted = Roster({k + 77: k for k in range(20)})
+    draws = []
+    for roster in (mirrored, shifted):
+        drawn = [[roster.name(node) for node in roster.draw(0.3, rng([0, r, 0]))] for r in range(8)]
+        draws.append(drawn)
+        assert all(len(set(names)) == 6 for names in drawn)
+    assert draws[0] == draws[1]
+    assert len({tuple(names) for names in draws[0]}) > 1
+    assert mirrored.draw(0.0, rng(0)) == []
+    assert len(mirrored.draw(0.001, rng(0))) == 1
+
+
+def test_a_share_of_the_clients_is_asked():
+    asked = []
+    app = answering(lambda k, _: asked.append(k) or reply_content(random_arrays(k)))
+    one_round(app, 10, train_share=0.4, seed=3)
+    first = list(asked)
+    one_round(app, 10, train_share=0.4, seed=3)
+    assert len(first) == 4
+    assert asked == first * 2
+
+
+def test_what_a_client_does_to_a_message_stays_with_the_client():
+    seen = []
+
+    def vandal(k, arrays):
+        seen.append(digest(arrays))
+        for array in arrays.values():
+            array += 1
+        return reply_content(arrays)
+
+    one_round(answering(vandal), 3)
+    assert len(set(seen)) == 1
+
+
+def test_messages_carry_the_hash_that_clients_check():
+    checked = []
+
+    def content(k, arrays):
+        checked.append(digest(arrays))
+        return reply_content(arrays)
+
+    app = ClientApp()
+
+    @app.train()
+    def train(message, context):
+        arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes_of(GOOD))
+        return Message(RecordDict(content(0, arrays)), reply_to=message)
+
+    _, _, events = one_round(app, 2, start=GOOD)
+    assert events.rejected() == {}
+    assert checked == [digest(GOOD)] * 2
+
+
+def introducing(partition_of) -> ClientApp:
+    app = ClientApp()
+    stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in ("observation.state", "action")}
+
+    @app.query()
+    def query(message, context):
+        k = context.node_config["partition-id"]
+        note = wire.note(partition_id=partition_of[k], num_examples=5 + k, stats=wire.pack_stats(stats))
+        return Message(RecordDict({wire.NOTE: note}), reply_to=message)
+
+    return app
+
+
+def test_roll_call_orders_by_partition_and_rejects_a_double():
+    events = Events()
+    grid = InlineGrid(introducing([2, 0, 2, 1]), 4, {})
+    roster, introductions = call(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)
+    assert [one.partition_id for one in introductions] == [0, 1, 2]
+    assert sorted(roster.partition_of.values()) == [0, 1, 2]
+    assert list(events.rejected().values()) == ["partition"]
+
+
+def test_missing_clients_are_named_with_the_remedy():
+    grid = InlineGrid(introducing([0, 1]), 2, {})
+    with pytest.raises(TooFewReplies, match="2 of num-clients=3 clients connected.*num-supernodes=3"):
+        wait_for_nodes(grid, 3, 0.1)
+
+
+@pytest.mark.parametrize("name", ["../evil.mp4", "rollout_1.py", "/tmp/rollout_1.mp4", "rollout_a/b.mp4"])
+def test_a_client_cannot_choose_where_the_server_writes(name):
+    note = wire.note(rollouts="[]", file_names=[name], files=[b"x"])
+    with pytest.raises(ValueError, match="expected files rollout_"):
+        wire.unpack_rollouts(RecordDict({wire.NOTE: note}))
