@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from papermill.exceptions import PapermillExecutionError
 ROOT = Path(__file__).resolve().parent.parent
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
 RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
+BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
 
@@ -91,15 +92,21 @@ def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
             raise BookError(f"{notebook.name} has no parameter {name!r}: its parameters cell has {sorted(known)}")
 
 
-def execute_if_changed(notebook: Path, folder: Path, profile: str, library: str) -> Chapter:
-    """Return the executed copy of `notebook` in `folder`, made again only when its key changed.
+def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
+    """Return the executed copy of `notebook` in `folder` if nothing it depends on has changed since, else None."""
+    target, key = folder / notebook.name, notebook_key(notebook, library)
+    if not target.is_file() or (stamp := _stamp(target)).get("key") != key:
+        return None
+    return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
+
+
+def execute(notebook: Path, folder: Path, profile: str, library: str) -> Chapter:
+    """Execute `notebook` at `profile` and put the copy with its results into `folder`.
 
     Raises:
         BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
     """
     target, key = folder / notebook.name, notebook_key(notebook, library)
-    if target.is_file() and (stamp := _stamp(target)).get("key") == key:
-        return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
     parameters = {"profile": profile}
     check_parameters(notebook, parameters)
     seconds = _execute(notebook, target, parameters)
@@ -149,27 +156,42 @@ def _finish(target: Path, key: str, profile: str, seconds: float) -> None:
     os.replace(_unfinished(target), target)
 
 
-def execute_chapters(root: Path, profile: str, only: str = "") -> list[Chapter]:
-    """Execute the chapters of the table of contents whose name contains `only`, in order, saying what each costs."""
-    library = library_key(root, profile)
-    names = [page for page in toc_pages(root) if (root / f"{page}.ipynb").is_file() and only in page]
-    if not names:
+def execute_chapters(
+    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None
+) -> list[Chapter]:
+    """Execute the chapters of the contents whose name contains `only` and that changed, saying what each costs.
+
+    Args:
+        prepare: called with the profile before the first chapter that has to be executed.
+    """
+    library, folder = library_key(root, profile), root / "_build" / profile / "executed"
+    notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file() and only in page]
+    if not notebooks:
         raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
-    chapters = []
-    for index, name in enumerate(names, start=1):
-        print(f"[{index}/{len(names)}] {name}, profile {profile} ...", flush=True)
-        chapter = execute_if_changed(root / f"{name}.ipynb", root / "_build" / profile / "executed", profile, library)
-        print(f"[{index}/{len(names)}] {name}: {_cost(chapter)}", flush=True)
-        chapters.append(chapter)
-    return chapters
+    chapters = {path: reuse(path, folder, library) for path in notebooks}
+    if not all(chapters.values()):
+        prepare(profile)
+    for number, path in enumerate(notebooks, start=1):
+        if chapters[path] is None:
+            print(f"[{number}/{len(notebooks)}] {path.stem}, profile {profile} ...", flush=True)
+        chapters[path] = chapters[path] or execute(path, folder, profile, library)
+        print(f"[{number}/{len(notebooks)}] {path.stem}: {_cost(chapters[path])}", flush=True)
+    return list(chapters.values())
+
+
+def record_data(profile: str) -> None:
+    """Record the demonstrations that the chapters share, so that no chapter's time contains it."""
+    command = [sys.executable, "-m", "fedvla_lib.cli", "record", "--profile", profile]
+    if subprocess.run(command, check=False).returncode:
+        raise BookError("the demonstrations could not be recorded")
 
 
 def _cost(chapter: Chapter) -> str:
     return f"unchanged, took {chapter.seconds:.0f} s" if chapter.reused else f"executed in {chapter.seconds:.0f} s"
 
 
-def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> None:
-    """Lay pages, executed chapters and configuration into `source`, touching only what changed.
+def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> str:
+    """Lay pages, executed chapters and configuration into `source` and return a digest of it all.
 
     Unchanged files keep their time stamp, so that Sphinx reads and writes only the pages that differ.
     """
@@ -183,6 +205,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         _write_if_changed(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
         path.unlink()
+    parts = [path.as_posix().encode() + b"\0" + content for path, content in sorted(wanted.items())]
+    return _digest([Path(__file__).read_bytes(), *parts])
 
 
 def _rendering_config(root: Path) -> bytes:
@@ -245,30 +269,39 @@ def _undescribed_images(page: Path) -> int:
 def build(root: Path, profile: str, only: str, execute_only: bool) -> Path | None:
     """Execute what changed and, unless `execute_only`, build the book; return its front page."""
     start = time.monotonic()
-    chapters = execute_chapters(root, profile, only)
+    chapters = execute_chapters(root, profile, only, prepare=record_data)
     if execute_only:
         print(f"{len(chapters)} chapters executed at profile {profile}", flush=True)
         return None
-    work = root / "_build" / profile
-    lay_out(root, work / "source", chapters, profile)
-    count = check_pages(root, render(work / "source", work))
-    published = publish(work / "_build" / "html", root / "_build" / "html" / profile)
+    work, published = root / "_build" / profile, root / "_build" / "html" / profile
+    digest = lay_out(root, work / "source", chapters, profile)
+    if not is_published(published, digest):
+        html = render(work / "source", work)
+        check_pages(root, html)
+        publish(html, published, digest)
+    count = check_pages(root, published)
     print(f"{count} pages, {len(chapters)} chapters, profile {profile}, {time.monotonic() - start:.0f} s")
     return published / "index.html"
 
 
-def publish(html: Path, target: Path) -> Path:
+def is_published(target: Path, digest: str) -> bool:
+    """Return whether the pages at `target` were built from the sources with this digest."""
+    mark = target / BUILT_FROM
+    return mark.is_file() and mark.read_text() == digest
+
+
+def publish(html: Path, target: Path, digest: str) -> None:
     """Put the finished pages at `target` in one step: a build that fails leaves the last good book in place."""
     target.parent.mkdir(parents=True, exist_ok=True)
     fresh, old = target.with_name(target.name + ".new"), target.with_name(target.name + ".old")
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
     shutil.copytree(html, fresh)
+    (fresh / BUILT_FROM).write_text(digest)
     if target.exists():
         os.replace(target, old)
     os.replace(fresh, target)
     shutil.rmtree(old, ignore_errors=True)
-    return target
 
 
 def main(argv: list[str] | None = None) -> int:

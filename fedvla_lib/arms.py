@@ -5,14 +5,13 @@ clients; ``centralized`` pools the clients' training episodes. Results are kept 
 by the library's own code, so that a change of either trains anew.
 """
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
-from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.config import Config, cache_dir, code_digest
 from fedvla_lib.train import local_train
 
 
@@ -90,7 +89,4 @@ def _pooled_stats(config: Config) -> str:
 
 def _key(config: Config) -> str:
     """Identify settings and code: a model trained by older code must not pass for a result of this one."""
-    digest = hashlib.sha256(run_folder.config_hash(config).encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
-    return digest.hexdigest()[:16]
+    return f"{run_folder.config_hash(config)}-{code_digest()}"

@@ -18,7 +18,7 @@ import pandas as pd
 import torch
 from lerobot.datasets import aggregate_stats
 
-from fedvla_lib.config import Config, cache_dir, task_names
+from fedvla_lib.config import Config, cache_dir, code_digest, task_names
 from fedvla_lib.record import record
 from fedvla_lib.source import DataError
 from fedvla_lib.spec import ACTION_KEY, STATE_KEY, image_key
@@ -31,6 +31,7 @@ __all__ = [
 
 Stats = dict[str, dict[str, np.ndarray]]  # feature key -> mean, std, min, max, count
 
+RECORDED_BY = ("tasks", "scene", "sim", "expert", "rollout", "record")  # a recording follows from this code and its settings
 SHIFT_SHARE = 0.04  # largest random shift, as a share of the image side: 4 pixels of 96
 CONTRAST, BRIGHTNESS = 0.2, 0.1  # contrast is scaled by 1 +- 0.2, brightness moved by +- 0.1 of full scale
 ORDER_STREAM, AUGMENT_STREAM = 0, 1  # which independent random stream of a seed is meant
@@ -42,7 +43,7 @@ def resolve(config: Config) -> Path | str:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
     tasks = task_names(config)
-    key = json.dumps([tasks, config.image_size, config.episodes_per_task, config.seed])
+    key = json.dumps([tasks, config.image_size, config.episodes_per_task, config.seed, code_digest(*RECORDED_BY)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     root = cache_dir() / "recordings" / name
     return record(tasks, config.episodes_per_task, root, image_size=config.image_size, seed=config.seed)
@@ -96,7 +97,9 @@ def frame_rows(store: FrameStore, episode_ids: Iterable[int]) -> np.ndarray:
     ids = sorted({int(episode_id) for episode_id in episode_ids})
     unknown = [episode_id for episode_id in ids if episode_id not in table.index]
     if unknown or not ids:
-        raise ValueError(f"{store.root} has no episode {unknown[0]}" if unknown else "no episodes: give at least one id")
+        raise ValueError(
+            f"{store.root} has no episode {unknown[0]}" if unknown else "no episodes: give at least one id"
+        )
     return np.concatenate([np.arange(table.at[i, "start"], table.at[i, "end"]) for i in ids])
 
 
@@ -174,7 +177,7 @@ def targets(store: FrameStore, rows: np.ndarray, chunk_size: int) -> dict[str, A
 
 
 def _augment(pictures: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """Shift each camera's picture on its own, as if its mount were knocked; light is common to all cameras of a sample."""
+    """Shift each camera's picture on its own, as if its mount were knocked; the light is common to all cameras."""
     batch_size = len(next(iter(pictures.values())))
     contrast = _column(rng.uniform(1 - CONTRAST, 1 + CONTRAST, batch_size))
     brightness = _column(rng.uniform(-BRIGHTNESS, BRIGHTNESS, batch_size))

@@ -125,6 +125,7 @@ def read_video(path: Path) -> np.ndarray:
     Raises:
         ValueError: the file is no readable video; the message names it.
     """
+    av.logging.set_level(None)  # LeRobot's encoder leaves libav printing to stderr; the exception says what is wrong
     try:
         with av.open(str(path)) as container:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])

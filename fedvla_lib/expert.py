@@ -179,32 +179,39 @@ def _place_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
 
 
 def _push_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
-    """Come down beside the cube with the jaws as a fork, sweep it along an arc into the zone, draw back a little."""
-    x, y, _ = env.cube_m
-    radius_m, bearing = float(np.hypot(x, y)), float(np.arctan2(y, x))
-    beside = bearing - FORK_GAP_M / radius_m
-    x, y = radius_m * np.cos(beside), radius_m * np.sin(beside)
-    hover = _move(start, (x, y, HOVER_HEIGHT_M), beside + np.pi / 2, FORK)
-    down = _move(hover, (x, y, PUSH_HEIGHT_M), beside + np.pi / 2, FORK)
-    zone_radius_m, zone_bearing = np.hypot(*env.layout.zone_xy_m), np.arctan2(*env.layout.zone_xy_m[::-1])
-    end = zone_bearing - FORK_CONTACT_M / zone_radius_m
-    sweep = _arc(down, (zone_radius_m * np.cos(end), zone_radius_m * np.sin(end)), PUSH_HEIGHT_M, FORK)
-    return [hover, down, *sweep]
+    """Come down beside the cube with the jaws as a fork and sweep it along an arc into the zone."""
+    radius_m, bearing_rad = _polar(*env.cube_m[:2])
+    beside_rad = bearing_rad - FORK_GAP_M / radius_m
+    x, y = _cartesian(radius_m, beside_rad)
+    yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
+    hover = _move(start, (x, y, HOVER_HEIGHT_M), yaw_rad, FORK)
+    down = _move(hover, (x, y, PUSH_HEIGHT_M), yaw_rad, FORK)
+    radius_m, bearing_rad = _polar(*env.layout.zone_xy_m)
+    end = _cartesian(radius_m, bearing_rad - FORK_CONTACT_M / radius_m)
+    return [hover, down, *_arc(down, end, PUSH_HEIGHT_M, FORK)]
 
 
 def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
-    """The way to `end_xy_m` around the base, turning the gripper along, as short pieces at one speed."""
+    """The way to `end_xy_m` around the base, turning the gripper along, as one waypoint per control step."""
     x, y, z = begin.position_m
-    turn = np.arctan2(end_xy_m[1], end_xy_m[0]) - np.arctan2(y, x)
-    radii_m = np.hypot(x, y), np.hypot(*end_xy_m)
-    steps = max(MIN_STEPS, round(abs(turn) * max(radii_m) / SPEED_M))
+    (radius_m, bearing_rad), (end_radius_m, end_bearing_rad) = _polar(x, y), _polar(*end_xy_m)
+    turn_rad = end_bearing_rad - bearing_rad
+    steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / SPEED_M))
     path = []
     for step in range(1, steps + 1):
         share = _smooth(step / steps)
-        radius_m, bearing = (1 - share) * radii_m[0] + share * radii_m[1], np.arctan2(y, x) + share * turn
-        position_m = (radius_m * np.cos(bearing), radius_m * np.sin(bearing), (1 - share) * z + share * height_m)
-        path.append(Waypoint(position_m, begin.yaw_rad + share * turn, gripper, 1))
+        point = _cartesian(radius_m + share * (end_radius_m - radius_m), bearing_rad + share * turn_rad)
+        path.append(Waypoint((*point, z + share * (height_m - z)), begin.yaw_rad + share * turn_rad, gripper, 1))
     return path
+
+
+def _polar(x: float, y: float) -> tuple[float, float]:
+    """Radius in metres and bearing in radians, around the arm's first joint."""
+    return float(np.hypot(x, y)), float(np.arctan2(y, x))
+
+
+def _cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
+    return float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))
 
 
 PLANS = {"lift": _lift_plan, "place": _place_plan, "push": _push_plan}

@@ -154,6 +154,7 @@ def _random_nano(config: Config) -> SmolVLAPolicy:
         vlm_model_name=str(ensure_nano(cache_dir(), config.image_size)),
         num_vlm_layers=0,  # 0 keeps all layers the backbone has
         resize_imgs_with_padding=(config.image_size, config.image_size),
+        device=config.device,  # left out, LeRobot looks for an accelerator and logs two warnings
     )
     _adapt(settings, config)
     with torch.random.fork_rng(devices=[]):

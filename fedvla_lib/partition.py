@@ -28,8 +28,8 @@ def partition(
     - modulo: episodes are ordered by task, then id, and dealt out like cards, the k-th to client ``k % num_clients``.
       Every client gets the same mix, give or take one episode of each task. (Plain ``episode_id % num_clients`` would
       not do: recordings alternate the tasks, so with 3 tasks and 3 clients each client would get one task.)
-    - task: client k holds task ``k % num_tasks``; clients with the same task share its episodes evenly. With fewer clients
-      than tasks, client k holds tasks k, k + num_clients, ...
+    - task: client k holds task ``k % num_tasks``; clients with the same task share its episodes evenly. With fewer
+      clients than tasks, client k holds tasks k, k + num_clients, ...
     - dirichlet: each task's episodes are divided in proportions drawn from Dirichlet(alpha, ..., alpha) over the
       clients (Hsu et al., arXiv:1909.06335). Small `alpha` gives few tasks a client and unequal sizes. Draws that leave
       a client without an episode are drawn again.
@@ -81,9 +81,9 @@ def heterogeneity(parts: Sequence[Sequence[int]], table: pd.DataFrame) -> dict[s
     """Measure how different the clients' task mixes are.
 
     Client k holds n_k of n episodes, a share p_k(t) of its own being of task t; p(t) is the share among all. The total
-    variation distance of client k is ``d_k = 1/2 * sum_t |p_k(t) - p(t)|``: the share of its episodes that would have to
-    be swapped to make its mix the common one. The measure is ``sum_k (n_k / n) * d_k``: 0 if all clients have the same mix
-    (IID), ``1 - sum_t p(t)^2`` if each has one task only (2/3 for three equal tasks).
+    variation distance of client k is ``d_k = 1/2 * sum_t |p_k(t) - p(t)|``: the share of its episodes that would have
+    to be swapped to make its mix the common one. The measure is ``sum_k (n_k / n) * d_k``: 0 if all clients have the
+    same mix (IID), ``1 - sum_t p(t)^2`` if each has one task only (2/3 for three equal tasks).
 
     Returns:
         ``total_variation`` (the measure), ``per_client`` (d_k), ``sizes`` (n_k), ``frames`` (per client; if `table` has
@@ -97,7 +97,11 @@ def heterogeneity(parts: Sequence[Sequence[int]], table: pd.DataFrame) -> dict[s
     mixes = counts.to_numpy() / np.maximum(sizes, 1)[:, None]
     pooled = counts.to_numpy().sum(axis=0) / max(sizes.sum(), 1)
     per_client = 0.5 * np.abs(mixes - pooled).sum(axis=1)
-    frames = held.groupby("client")["num_frames"].sum().reindex(range(len(parts)), fill_value=0) if "num_frames" in held else []
+    frames = (
+        held.groupby("client")["num_frames"].sum().reindex(range(len(parts)), fill_value=0)
+        if "num_frames" in held
+        else []
+    )
     return {
         "total_variation": float((sizes * per_client).sum() / max(sizes.sum(), 1)),
         "per_client": [float(distance) for distance in per_client],
@@ -133,9 +137,15 @@ def _by_task(table: pd.DataFrame, num_clients: int) -> list[list[int]]:
         sharing = len(range(label, num_clients, groups))
         if scarce[label] < sharing:
             names = ", ".join(task for task in tasks if labels[task] == label)
-            raise ValueError(f"{sharing} clients cannot share the {scarce[label]} episodes of {names}: use fewer clients")
+            raise ValueError(
+                f"{sharing} clients cannot share the {scarce[label]} episodes of {names}: use fewer clients"
+            )
     partitioner = PathologicalPartitioner(
-        num_clients, partition_by="label", num_classes_per_partition=1, class_assignment_mode="deterministic", shuffle=False
+        num_clients,
+        partition_by="label",
+        num_classes_per_partition=1,
+        class_assignment_mode="deterministic",
+        shuffle=False,
     )
     return _ids(partitioner, table, num_clients)
 
@@ -145,7 +155,12 @@ def _dirichlet(table: pd.DataFrame, num_clients: int, seed: int, alpha: float) -
     for draw in range(MAX_DRAWS):
         generator_seed = int(np.random.SeedSequence([seed, draw]).generate_state(1)[0])
         partitioner = DirichletPartitioner(
-            num_clients, partition_by="task", alpha=float(alpha), min_partition_size=1, shuffle=False, seed=generator_seed
+            num_clients,
+            partition_by="task",
+            alpha=float(alpha),
+            min_partition_size=1,
+            shuffle=False,
+            seed=generator_seed,
         )
         try:
             with warnings.catch_warnings():

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 
 from fedvla_lib.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
@@ -20,6 +21,7 @@ STYLE = {
     "savefig.facecolor": "white",
     "axes.facecolor": "white",
     "axes.grid": True,
+    "axes.axisbelow": True,  # bars cover the grid
     "grid.color": "#DDDDDD",
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -55,10 +57,13 @@ def film_strip(frames: np.ndarray, *, count: int = 6, title: str = "", ax: Axes 
     """Draw `count` frames of a video (T, H, W, 3), evenly spaced from first to last, side by side."""
     picks = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
     if ax is None:
-        _, ax = plt.subplots(figsize=(10, 10 / len(picks) * frames.shape[1] / frames.shape[2] + 0.5), layout="constrained")
-    width = frames.shape[2]
-    ax.imshow(np.concatenate(list(frames[picks]), axis=1))
-    ax.set_xticks((np.arange(len(picks)) + 0.5) * width, [f"{i / FPS:.1f} s" for i in picks])
+        height = 10 / len(picks) * frames.shape[1] / frames.shape[2] + 0.5
+        _, ax = plt.subplots(figsize=(10, height), layout="constrained")
+    gap = max(1, frames.shape[2] // 32)  # white, so that one frame does not run into the next
+    spaced = np.pad(frames[picks], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
+    ax.imshow(np.concatenate(list(spaced), axis=1)[:, :-gap])
+    centres = np.arange(len(picks)) * spaced.shape[2] + frames.shape[2] / 2
+    ax.set_xticks(centres, [f"{i / FPS:.1f} s" for i in picks])
     ax.set_yticks([])
     ax.grid(False)
     ax.set_xlabel("time in the episode")
@@ -166,7 +171,7 @@ def trainable_bars(tables: dict[str, pd.DataFrame], *, ax: Axes | None = None) -
 def flow(
     points: np.ndarray, times: Sequence[float], *, ylabel: str, goal: np.ndarray | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw one joint of an action chunk on its way from noise to plan: `points` (times, chunk), a line per flow time."""
+    """Draw one joint of an action chunk from noise to plan: `points` (times, chunk), a line per flow time."""
     ax = ax or _new_axes()
     steps = np.arange(1, points.shape[1] + 1)
     shades = plt.get_cmap("viridis")(np.asarray(times) * 0.9)
@@ -182,7 +187,7 @@ def flow(
 def padding(masks: np.ndarray, *, ax: Axes | None = None) -> Axes:
     """Draw which steps of action chunks are padding: `masks` bool (samples, chunk)."""
     ax = ax or _new_axes()
-    colors = plt.matplotlib.colors.ListedColormap([PALETTE[0], "#DDDDDD"])
+    colors = ListedColormap([PALETTE[0], "#DDDDDD"])
     ax.imshow(masks, cmap=colors, vmin=0, vmax=1, aspect="auto", extent=(0.5, masks.shape[1] + 0.5, len(masks), 0))
     for value, name in enumerate(("real action: counts in the loss", "padding: left out")):
         ax.plot([], [], "s", color=colors(value), label=name)
@@ -198,7 +203,7 @@ def learning_rate(rates: Sequence[float], *, ax: Axes | None = None) -> Axes:
     """Draw the learning rate of each optimiser step."""
     ax = ax or _new_axes()
     ax.plot(np.arange(1, len(rates) + 1), rates, "-" if len(rates) > 20 else "o-")
-    ax.set_ylim(bottom=0)
+    ax.set_ylim(0, 1.1 * max(rates))
     ax.set_xlabel("optimiser step")
     ax.set_ylabel("learning rate of AdamW")
     return ax
@@ -225,7 +230,7 @@ def loss_and_success(table: pd.DataFrame, x: str, *, xlabel: str, axes: Sequence
         _, axes = plt.subplots(2, 1, figsize=(7, 4.8), sharex=True, layout="constrained")
     axes[0].plot(table[x], table.loss, "o-", color=PALETTE[1])
     axes[0].set_ylabel("held-out loss\n[normalised units²]")
-    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylim(0, 1.1 * table.loss.max())
     seen = table.dropna(subset=["success_rate"])
     errors = np.abs(np.stack([seen.success_rate - seen.low, seen.high - seen.success_rate]))
     axes[1].errorbar(seen[x], seen.success_rate, yerr=errors, fmt="o-", capsize=3, color=PALETTE[0])
@@ -317,7 +322,8 @@ def pictures(rows: dict[str, np.ndarray], *, titles: Sequence[str] = (), axes: n
     """Draw a table of pictures: each entry of `rows` is one row of them, (n, H, W, 3); `titles` name the columns."""
     count = len(next(iter(rows.values())))
     if axes is None:
-        size = (10, 10 / count * len(rows) + 0.4)
+        side = min(10 / count, 2.2)
+        size = (side * count, side * len(rows) + 0.4)
         _, axes = plt.subplots(len(rows), count, figsize=size, layout="constrained", squeeze=False)
     for line, (name, frames) in zip(axes, rows.items(), strict=True):
         line[0].set_ylabel(name)
@@ -366,9 +372,10 @@ def client_counts_grid(counts: dict[str, pd.DataFrame], *, axes: Sequence[Axes] 
         client_counts(table, ax=ax)
         ax.set_title(name, fontsize=10)
         ax.get_legend().remove()
+        ax.yaxis.set_major_locator(plt.MaxNLocator(integer=True))
     for ax in axes[1:]:
         ax.set_ylabel("")
-    axes[0].legend(frameon=False, title="task")
+    _legend_above(axes)
     return axes
 
 
@@ -385,7 +392,7 @@ def heterogeneity(table: pd.DataFrame, *, bounds: dict[str, float] | None = None
     ax.set_ylim(bottom=-0.02)
     ax.set_xlabel("Dirichlet concentration alpha (log scale)")
     ax.set_ylabel("total variation distance")
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(frameon=False, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.12))
     return ax
 
 
@@ -412,7 +419,7 @@ def client_statistics(
         ax.set_xticks(places)
     for ax in axes[-3:]:
         ax.set_xlabel("client")
-    axes[0].legend(frameon=False, fontsize=8)
+    _legend_above(axes)
     return axes
 
 
@@ -426,8 +433,14 @@ def client_weights(weights: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xticks(range(len(weights)), weights.index.astype(str))
     ax.set_xlabel("client")
     ax.set_ylabel("weight in the average [%]")
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, ncols=len(weights.columns), loc="upper center", bbox_to_anchor=(0.5, 1.14))
     return ax
+
+
+def _legend_above(axes: Sequence[Axes]) -> None:
+    """One legend for panels that share their labels, above all of them."""
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside upper center")
 
 
 def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
@@ -484,7 +497,7 @@ def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
         color = ARM_COLORS.get(point.arm, PALETTE[i % len(PALETTE)])
         error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
         ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.arm)
-    ax.set_xlim(left=0)
+    ax.set_xlim(0, 1.1 * table.loss.max())
     ax.set_ylim(-0.02, 1.02)
     ax.set_xlabel("held-out loss [normalised units²]")
     ax.set_ylabel("success rate (95 % Wilson interval)")
@@ -499,6 +512,8 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     errors = np.abs(np.stack([table.difference - table.low, table.high - table.difference]))
     ax.errorbar(100 * table.difference, places, xerr=100 * errors, fmt="o", capsize=4, color=PALETTE[0])
     ax.axvline(0, color="#555555", linewidth=1)
+    reach = max(20, 105 * table[["low", "high"]].abs().to_numpy().max())
+    ax.set_xlim(-reach, reach)
     ax.set_yticks(places, table.arm + " − " + table.other)
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("difference in success rate [points], 95 % bootstrap interval")

@@ -1,10 +1,11 @@
 """Expert demonstrations -> a LeRobotDataset v3.0 folder that survives every kind of interruption.
 
-LeRobot writes an episode into a staging folder inside the data set, where its files are closed. Then they are moved into
-place one by one, ``meta/info.json``, which counts the episodes, last. Each move is atomic, so at any moment the folder
-is a data set that LeRobot opens and that holds complete episodes only; a killed process (SIGKILL too) loses the episode
-it was working on and no more. Episode i has its own files, number i, and its own seeds: what it holds does not depend on
-when or in how many sittings the recording was made. This module knows nothing about training.
+LeRobot writes an episode into a staging folder inside the data set, where its files are closed. Then they are put in
+place one by one, ``meta/info.json``, which counts the episodes, last. Each of these steps is atomic, so from the first
+episode on the folder is at any moment a data set that LeRobot opens and that holds complete episodes only; a killed
+process (SIGKILL too) loses the episode it was working on and no more. Episode i has its own files, number i, and its
+own seeds: what it holds does not depend on when or in how many sittings the recording was made. This module knows
+nothing about training.
 """
 
 import json
@@ -114,9 +115,13 @@ def _settings(tasks: list[str], episodes_per_task: int, image_size: int, seed: i
 def _check_folder(root: Path, settings: dict[str, Any]) -> None:
     """Raise ValueError unless `root` is empty or a recording with these settings and at most as many episodes."""
     if not (root / SETTINGS_FILE).exists():
-        foreign = sorted(path.name for path in root.iterdir() if path.name not in (STAGING, LOCK)) if root.is_dir() else []
+        foreign = (
+            sorted(path.name for path in root.iterdir() if path.name not in (STAGING, LOCK)) if root.is_dir() else []
+        )
         if foreign or root.is_file():
-            raise ValueError(f"{root} is not a recording made by this command ({', '.join(foreign)}): give another folder")
+            raise ValueError(
+                f"{root} is not a recording made by this command ({', '.join(foreign)}): give another folder"
+            )
         return
     found = json.loads((root / SETTINGS_FILE).read_text())
     for name, value in settings.items():
@@ -164,7 +169,7 @@ class _Recorder:
         self._root, self._staging, self._next = root, root / STAGING, num_recorded
         self._stats = [_stats_of(root, index) for index in range(num_recorded)]
         shutil.rmtree(self._staging, ignore_errors=True)
-        av.logging.set_libav_level(av.logging.ERROR)  # else the encoder reports every episode on the terminal
+        av.logging.set_libav_level(av.logging.FATAL)  # no report of each episode; errors are raised
         writing = {
             "repo_id": REPO_ID,
             "root": self._staging,

@@ -1,4 +1,4 @@
-"""Reads any LeRobotDataset v3.0 of an SO-100, from a folder or the hub, and checks everything that can be wrong with it.
+"""Reads any LeRobotDataset v3.0 of an SO-100, from a folder or the hub, and checks what can be wrong with it.
 
 Whatever does not fit is a `DataError` that names file and episode. This module keeps nothing: `store` writes what it
 yields into arrays.
@@ -52,7 +52,9 @@ def locate(source: str | Path) -> Path:
     if (HF_LEROBOT_HOME / source / "meta/info.json").exists():
         return HF_LEROBOT_HOME / source
     try:
-        return Path(snapshot_download(str(source), repo_type="dataset", revision=FORMAT, cache_dir=HF_LEROBOT_HUB_CACHE))
+        return Path(
+            snapshot_download(str(source), repo_type="dataset", revision=FORMAT, cache_dir=HF_LEROBOT_HUB_CACHE)
+        )
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, OSError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise DataError(
@@ -126,7 +128,7 @@ def _check_features(root: Path, info: dict[str, Any]) -> None:
         names = _flat_names(feature.get("names"))
         if [_plain(name) for name in names] != [_plain(name) for name in JOINT_NAMES]:
             raise DataError(
-                f"{root / 'meta/info.json'}, every episode: {key} has the columns {', '.join(names) or 'without names'}, "
+                f"{root / 'meta/info.json'}, every episode: {key} has the columns {', '.join(names) or 'nothing'}, "
                 f"needed are {', '.join(JOINT_NAMES)} in this order"
             )
 
@@ -146,18 +148,14 @@ def _plain(name: str) -> str:
 def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | None) -> dict[str, str]:
     """Our camera -> feature key, by the given mapping or by the names people commonly use."""
     found = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    names = {key.removeprefix(IMAGE_PREFIX): key for key in found}
-    wanted = {ours: (name,) for ours, name in cameras.items()} if cameras else CAMERA_ALIASES
-    mapping = {}
-    for ours, candidates in wanted.items():
-        keys = [names[name.removeprefix(IMAGE_PREFIX)] for name in candidates if name.removeprefix(IMAGE_PREFIX) in names]
-        if keys:
-            mapping[ours] = keys[0]
+    keys = {key.removeprefix(IMAGE_PREFIX): key for key in found}
+    wanted = {ours: (name.removeprefix(IMAGE_PREFIX),) for ours, name in cameras.items()} if cameras else CAMERA_ALIASES
+    mapping = {ours: keys[name] for ours, names in wanted.items() for name in reversed(names) if name in keys}
     missing = [ours for ours in wanted if ours not in mapping]
     if missing and (cameras or len(found) >= len(CAMERAS) or not mapping):
         raise DataError(
-            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(names) or 'none'}: say which "
-            f"one to use, for instance cameras={{{missing[0]!r}: {next(iter(names), 'NAME')!r}}}"
+            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: say "
+            f"which to use, for instance cameras={{{missing[0]!r}: {next(iter(keys), 'NAME')!r}}}"
         )
     return mapping
 
@@ -176,7 +174,9 @@ def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
     table = table.sort_values("episode_index").set_index("episode_index", drop=False)
     lacking = sorted(set(range(total)) - set(table.index))
     if lacking:
-        raise DataError(f"{root / 'meta/episodes'}: episode {lacking[0]} is not listed, info.json counts {total} episodes")
+        raise DataError(
+            f"{root / 'meta/episodes'}: episode {lacking[0]} is not listed, info.json counts {total} episodes"
+        )
     return table.loc[range(total)].reset_index(drop=True)
 
 
@@ -228,7 +228,9 @@ def _vectors(where: str, key: str, column: pd.Series) -> np.ndarray:
     """A column of six-vectors as float32 (T, 6), all finite."""
     shapes = sorted({np.shape(value) for value in column})
     if shapes != [(NUM_JOINTS,)]:
-        raise DataError(f"{where}: {key} has shape {shapes[0] if len(shapes) == 1 else shapes}, needed is ({NUM_JOINTS},)")
+        raise DataError(
+            f"{where}: {key} has shape {shapes[0] if len(shapes) == 1 else shapes}, needed is ({NUM_JOINTS},)"
+        )
     values = np.stack(column.to_list()).astype(np.float32)
     if not np.isfinite(values).all():
         frame, joint = np.argwhere(~np.isfinite(values))[0]
@@ -239,7 +241,9 @@ def _vectors(where: str, key: str, column: pd.Series) -> np.ndarray:
 def pictures(source: Source, key: str) -> Iterator[tuple[int, np.ndarray]]:
     """Every frame of one camera as (store row, uint8 (H, W, 3)); all rows come exactly once."""
     is_video = source.info["features"][key]["dtype"] == "video"
-    kind, pattern, read = ("videos/" + key, "video_path", _video_pictures) if is_video else ("data", "data_path", _stills)
+    kind, pattern, read = (
+        ("videos/" + key, "video_path", _video_pictures) if is_video else ("data", "data_path", _stills)
+    )
     starts = source.episodes["start"].to_numpy()
     for (chunk, file), group in source.files.groupby([f"{kind}/chunk_index", f"{kind}/file_index"]):
         path = source.root / source.info[pattern].format(video_key=key, chunk_index=chunk, file_index=file)
@@ -261,10 +265,11 @@ def _video_pictures(
         if number in rows:
             yield rows.pop(number), picture
     if rows:
-        place = int(np.searchsorted(starts, min(rows.values()), side="right")) - 1
+        row = min(rows.values())
+        place = int(np.searchsorted(starts, row, side="right")) - 1
         raise DataError(
-            f"{path}, episode {group['episode_index'].iloc[place]}: the video lacks frame {min(rows.values()) - starts[place]}"
-            f" of {lengths[place]}; it is cut off or damaged"
+            f"{path}, episode {group['episode_index'].iloc[place]}: the video lacks frame {row - starts[place]} of "
+            f"{lengths[place]}; it is cut off or damaged"
         )
 
 
@@ -275,26 +280,26 @@ def _decode(path: Path, fps: float, episode_id: int) -> Iterator[tuple[int, np.n
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError) as error:
-        raise DataError(f"{path} cannot be opened as a video (episode {episode_id}): {error}") from error
+        raise DataError(f"{path} cannot be opened as a video (episode {episode_id}): {error.strerror}") from error
     with container:
         if not container.streams.video:
             raise DataError(f"{path} holds no video (episode {episode_id})")
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 0)
         if abs(rate - fps) > FPS_TOLERANCE * fps:
-            raise DataError(f"{path}, episode {episode_id}: runs at {rate:g} frames per second, meta/info.json says {fps}")
+            raise DataError(
+                f"{path}, episode {episode_id}: runs at {rate:g} frames per second, meta/info.json says {fps}"
+            )
         yield from _decode_stream(container, stream, fps)
 
 
 def _decode_stream(container: Any, stream: Any, fps: float) -> Iterator[tuple[int, np.ndarray]]:
-    frames: Iterable[Any] = container.decode(stream)
+    frames = container.decode(stream)
     while True:
         try:
-            frame = next(frames, None)
-        except av.FFmpegError:
+            frame = next(frames)
+        except (StopIteration, av.FFmpegError):
             return  # the caller knows which frames it still needs and says so
-        if frame is None:
-            return
         yield round(float(frame.pts * stream.time_base) * fps), frame.to_ndarray(format="rgb24")
 
 
@@ -308,4 +313,6 @@ def _stills(
             try:
                 yield start + step, np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB"))
             except (OSError, TypeError) as error:
-                raise DataError(f"{path}, episode {episode_id}: picture {step} of {key} cannot be read: {error}") from error
+                raise DataError(
+                    f"{path}, episode {episode_id}: picture {step} of {key} cannot be read: {error}"
+                ) from error

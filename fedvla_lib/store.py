@@ -1,8 +1,8 @@
 """A data set's frames, decoded once into memory-mapped arrays.
 
-Decoding a random video frame costs milliseconds, reading a row of an array microseconds, and training visits every frame
-many times. So `open_store` reads and checks a data set once, writes one ``.npy`` per camera into the cache and from then
-on only maps the files. This module does not know the format of a data set, nor what a batch is.
+Decoding a random video frame costs milliseconds, reading a row of an array microseconds, and training visits every
+frame many times. So `open_store` reads and checks a data set once, writes one ``.npy`` per camera into the cache and
+from then on only maps the files. This module does not know the format of a data set, nor what a batch is.
 """
 
 import hashlib

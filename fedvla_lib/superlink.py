@@ -6,6 +6,7 @@ These are the documented commands, wrapped because three of their defaults trip 
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -19,12 +20,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from fedvla_lib.config import Config, check, to_run_config
 
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
-POLL_S = 3.0
+STATUS_TRIES, POLL_S = 6, 5.0
 OFFLINE = {  # Flower and Ray ask the network nothing
     "FLWR_TELEMETRY_ENABLED": "0",
     "FLWR_DISABLE_UPDATE_CHECK": "1",
@@ -43,27 +43,38 @@ class SuperLink:
     """A SuperLink that is up, and the environment in which `flwr` finds it."""
 
     environment: dict[str, str]
-    log: Path
+    log: Path  # what the run printed
 
-    def flwr(self, *arguments: str) -> dict[str, Any]:
-        """Run a `flwr` command against this SuperLink and return its JSON answer.
+    def submit(self, app: Path, *options: str, timeout_s: float) -> str:
+        """Start a run of the app, follow its log until the run ends, and return its id.
+
+        Following costs nothing, while each further `flwr` command costs seconds of computing time.
 
         Raises:
-            FlowerRunError: the command failed.
+            FlowerRunError: the run was not accepted, or did not end in time.
         """
-        command = [_program("flwr"), *arguments, "--format", "json"]
-        done = subprocess.run(command, env=self.environment, capture_output=True, text=True)
-        start = done.stdout.find("{\n")
-        answer = json.loads(done.stdout[start:]) if start >= 0 else {}
-        if done.returncode or not answer.get("success"):
-            said = answer.get("error-message") or done.stderr or done.stdout
-            raise FlowerRunError(f"flwr {arguments[0]} failed: {' '.join(str(said).split())[-800:]}")
-        return answer
+        command = [_program("flwr"), "run", str(app), CONNECTION, *options, "--stream"]
+        with open(self.log, "wb") as log:
+            process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
+            try:
+                process.wait(timeout_s)
+            except subprocess.TimeoutExpired as error:
+                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {_tail(self.log)}") from error
+            finally:
+                process.kill()
+        accepted = re.search(r"Successfully started run (\d+)", self.log.read_text(errors="replace"))
+        if not accepted:
+            raise FlowerRunError(f"flwr run failed: {_tail(self.log)}")
+        return accepted[1]
 
     def status(self, run_id: str) -> tuple[str, str]:
         """Return a run's status, such as ``running`` or ``finished:completed``, and its details."""
-        run = self.flwr("list", CONNECTION, "--run-id", run_id)["runs"][0]
-        return run["status"], run.get("status-details") or ""
+        command = [_program("flwr"), "list", CONNECTION, "--run-id", run_id, "--format", "json"]
+        done = subprocess.run(command, env=self.environment, capture_output=True, text=True)
+        answer = json.loads(done.stdout[done.stdout.find("{\n") :]) if "{\n" in done.stdout else {}
+        if not answer.get("runs"):
+            raise FlowerRunError(f"flwr list failed: {_one_line(done.stderr or done.stdout)}")
+        return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
 
 
 def run_simulation(
@@ -76,16 +87,16 @@ def run_simulation(
         ValueError: unusable settings, or no checkout with a pyproject.toml around this library.
     """
     out = Path(config.out).resolve()
-    config = check(replace(config, out=str(out), num_threads=config.num_threads or cpus_per_client))
+    paths = {name: _absolute(getattr(config, name)) for name in ("data", "base")}
+    config = check(replace(config, out=str(out), num_threads=config.num_threads or cpus_per_client, **paths))
     before = set(out.glob("*"))
     resources = f"client-resources-num-cpus={cpus_per_client} client-resources-num-gpus={gpus_per_client}"
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
-        app, settings = stage_app(Path(folder)), _write_settings(Path(folder), config)
+        app, settings = stage_app(Path(folder)), write_settings(Path(folder), config)
         with local_superlink(Path(folder)) as link:
             federation = f"num-supernodes={config.num_clients} {resources}"
             options = ["--federation-config", federation, "--run-config", str(settings)]
-            run_id = link.flwr("run", str(app), CONNECTION, *options)["run-id"]
-            _wait_for_end(link, run_id, timeout_s)
+            _require_completed(link, link.submit(app, *options, timeout_s=timeout_s))
     return max(set(out.glob("*")) - before)
 
 
@@ -97,7 +108,8 @@ def local_superlink(home: Path) -> Iterator[SuperLink]:
         FlowerRunError: it did not answer within two minutes.
     """
     port = _free_port()
-    environment = {**os.environ, **OFFLINE, "FLWR_HOME": str(home)}
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # Flower calls its programs
+    environment = {**os.environ, **OFFLINE, "FLWR_HOME": str(home), "PATH": path}
     connection = f'[superlink.{CONNECTION}]\naddress = "127.0.0.1:{port}"\ninsecure = true\n'
     (home / "config.toml").write_text(f'[superlink]\ndefault = "{CONNECTION}"\n\n{connection}')
     log = home / "superlink.log"
@@ -106,7 +118,7 @@ def local_superlink(home: Path) -> Iterator[SuperLink]:
         process = subprocess.Popen(command, env=environment, stdout=output, stderr=output, start_new_session=True)
     try:
         _wait_until_up(process, port, log)
-        yield SuperLink(environment, log)
+        yield SuperLink(environment, home / "run.log")
     finally:
         _stop(process)
 
@@ -124,28 +136,36 @@ def stage_app(folder: Path) -> Path:
     return app
 
 
-def _write_settings(folder: Path, config: Config) -> Path:
-    """Write the settings as a TOML file for ``--run-config``: JSON's strings, numbers and booleans are TOML's."""
+def write_settings(folder: Path, config: Config) -> Path:
+    """Write ``folder/settings.toml`` for ``--run-config`` and return it: JSON's scalars are TOML's."""
     path = folder / "settings.toml"
     path.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in to_run_config(config).items()))
     return path
 
 
-def _wait_for_end(link: SuperLink, run_id: str, timeout_s: float) -> None:
-    deadline = time.monotonic() + timeout_s
-    status, details = link.status(run_id)
-    while not status.startswith("finished") and time.monotonic() < deadline:
-        time.sleep(POLL_S)
+def _absolute(name: str) -> str:
+    """Flower's processes choose their own working directory; a hub id stays as it is."""
+    return str(Path(name).resolve()) if name and Path(name).exists() else name
+
+
+def _require_completed(link: SuperLink, run_id: str) -> None:
+    """`flwr run` exits with 0 for failed runs too, so ask; the status may lag behind the end of the log."""
+    for _ in range(STATUS_TRIES):
         status, details = link.status(run_id)
+        if status.startswith("finished"):
+            break
+        time.sleep(POLL_S)
     if status != "finished:completed":
-        raise FlowerRunError(f"run {run_id} is {status} ({details}); the SuperLink's log ends: {_tail(link.log)}")
+        raise FlowerRunError(f"run {run_id} is {status} ({details}); its log ends: {_tail(link.log)}")
 
 
 def _wait_until_up(process: subprocess.Popen, port: int, log: Path) -> None:
     deadline = time.monotonic() + STARTUP_S
     while not _answers(port):
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise FlowerRunError(f"the SuperLink did not start within {STARTUP_S:.0f} s; its log ends: {_tail(log)}")
+        if process.poll() is not None:
+            raise FlowerRunError(f"the SuperLink ended with status {process.poll()}; its log ends: {_tail(log)}")
+        if time.monotonic() > deadline:
+            raise FlowerRunError(f"the SuperLink did not answer within {STARTUP_S:.0f} s; its log ends: {_tail(log)}")
         time.sleep(0.5)
 
 
@@ -183,4 +203,8 @@ def _free_port() -> int:
 
 
 def _tail(log: Path) -> str:
-    return " | ".join(log.read_text(errors="replace").splitlines()[-8:])
+    return _one_line(log.read_text(errors="replace"))
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())[-800:]

@@ -14,13 +14,14 @@ from filelock import FileLock
 from safetensors.numpy import load_file
 
 from fedvla_lib import data, model
-from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.config import Config, cache_dir, code_digest
 from fedvla_lib.params import load_arrays
 from fedvla_lib.train import WEIGHTS_FILE, TrainResult, local_train
 
 WARM_BASE = "nano-warm"
 TASK = "lift"
 RECORDING_SEED = 500_000  # the server's demonstrations are none of the clients'
+TRAINED_BY = (*data.RECORDED_BY, "source", "store", "data", "nano", "model", "train", "warm_start")  # code that decides
 # What the trained weights depend on: federations that differ in other settings begin with the same warm start.
 SETTINGS = (
     "image_size", "val_fraction", "chunk_size", "batch_size", "warmup_steps", "warm_steps", "warm_episodes", "warm_lr",
@@ -48,7 +49,7 @@ def recipe(config: Config) -> Config:
 
 def folder_of(config: Config) -> Path:
     """Return where the warm start of these settings is kept: a ``pretrained_model`` folder, if it exists."""
-    settings = {name: getattr(config, name) for name in SETTINGS}
+    settings = {name: getattr(config, name) for name in SETTINGS} | {"code": code_digest(*TRAINED_BY)}
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
     return cache_dir() / f"nano-warm-{key}"
 

@@ -74,9 +74,10 @@ def test_nested_sections_are_found(tmp_path):
 
 @pytest.mark.integration
 def test_executes_once_then_only_after_a_change(project, capsys):
-    ran = project / "notebooks" / "ran.txt"
-    first = build_book.execute_chapters(project, "tiny")[0]
-    again = build_book.execute_chapters(project, "tiny")[0]
+    ran, prepared = project / "notebooks" / "ran.txt", []
+    first = build_book.execute_chapters(project, "tiny", prepare=prepared.append)[0]
+    again = build_book.execute_chapters(project, "tiny", prepare=prepared.append)[0]
+    assert prepared == ["tiny"]
     assert (first.reused, again.reused) == (False, True) and again.seconds == pytest.approx(first.seconds, abs=0.1)
     assert ran.read_text() == "tiny\n", "papermill injects the profile, in the notebook's own folder"
     (project / "fedvla_lib" / "spec.py").write_text("FPS = 20\n")
@@ -120,13 +121,14 @@ def test_no_chapter_of_that_name(project):
 def test_lay_out_touches_only_what_changed(project):
     source = project / "_build" / "tiny" / "source"
     chapter = Chapter("one", project / "notebooks" / "one.ipynb", "key", 12.4, reused=False)
-    build_book.lay_out(project, source, [chapter], "tiny")
+    digest = build_book.lay_out(project, source, [chapter], "tiny")
+    assert build_book.lay_out(project, source, [chapter], "tiny") == digest
     times = {path: path.stat().st_mtime_ns for path in source.rglob("*") if path.is_file()}
     assert "execute_notebooks: 'off'" in (source / "_config.yml").read_text()
     assert "| 12 |" in (source / "book" / "run_times.md").read_text()
     (source / "old.md").write_text("a page of an earlier build")
     (project / "book" / "index.md").write_text("# New front\n")
-    build_book.lay_out(project, source, [chapter], "tiny")
+    assert build_book.lay_out(project, source, [chapter], "tiny") != digest
     changed = {path.name for path, time in times.items() if path.stat().st_mtime_ns != time}
     assert changed == {"index.md"} and not (source / "old.md").exists()
 
@@ -161,8 +163,9 @@ def test_publishing_replaces_the_whole_book(tmp_path):
     target = tmp_path / "published"
     target.mkdir()
     (target / "stale.html").write_text("old")
-    build_book.publish(tmp_path / "html", target)
-    assert [path.name for path in target.iterdir()] == ["index.html"]
+    build_book.publish(tmp_path / "html", target, "digest")
+    assert sorted(path.name for path in target.iterdir()) == [".built-from", "index.html"]
+    assert build_book.is_published(target, "digest") and not build_book.is_published(target, "another")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["html", "published"]
 
 

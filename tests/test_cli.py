@@ -96,18 +96,11 @@ def test_experts_prints_a_rate_with_its_interval(capsys):
     assert row.split()[:3] == ["lift", "2", "2"]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    """One recording and one decoded store for all tests of this module."""
-    return tmp_path_factory.mktemp("cache")
-
-
 TINY = ["--profile", "tiny", "--tasks", "lift", "--episodes-per-task", "4", "--base", "nano", "--num-clients", "2"]
 
 
 @pytest.mark.integration
-def test_train_then_evaluate(cache, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+def test_train_then_evaluate(tmp_path, capsys):
     out = tmp_path / "outputs"
     assert main(["train", *TINY, "--steps", "2", "--val-fraction", "0.25", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -122,8 +115,7 @@ def test_train_then_evaluate(cache, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.integration
-def test_resumed_training_ends_like_an_uninterrupted_one(cache, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+def test_resumed_training_ends_like_an_uninterrupted_one(tmp_path, capsys):
     common = [*TINY, "--client", "1", "--checkpoint-every", "1", "--out"]
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     assert main(["train", "--steps", "2", *common, str(whole)]) == 0
@@ -147,8 +139,7 @@ def _undo_last_step(root: Path) -> None:
 
 
 @pytest.mark.integration
-def test_run_prints_the_rounds_and_the_run_folder(cache, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("FEDVLA_CACHE", os.fspath(cache))
+def test_run_prints_the_rounds_and_the_run_folder(tmp_path, capsys):
     out = tmp_path / "outputs"
     assert main(["run", *TINY, "--num-server-rounds", "1", "--client-rollouts", "0", "--out", str(out)]) == 0
     lines = capsys.readouterr().out.strip().splitlines()

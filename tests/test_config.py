@@ -1,9 +1,7 @@
 """Settings: one dataclass, three profiles, one parser."""
 
 import re
-import tomllib
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 
@@ -20,7 +18,6 @@ from fedvla_lib.config import (
 )
 
 pytestmark = pytest.mark.unit
-ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -106,8 +103,3 @@ def test_cache_follows_the_environment(monkeypatch, tmp_path):
 
 def test_every_setting_has_a_sentence():
     assert set(setting_texts()) == {field.name for field in fields(Config)}
-
-
-def test_flower_knows_every_setting_with_its_default():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert project["tool"]["flwr"]["app"]["config"] == to_run_config(Config())

@@ -75,7 +75,9 @@ def test_statistics_are_of_the_given_episodes_only(store):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("clients", [[[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]], [[0], [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]]])
+@pytest.mark.parametrize(
+    "clients", [[[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]], [[0], [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]]]
+)
 def test_pooled_client_statistics_are_those_of_the_pooled_episodes(store, clients):
     pooled = pool_stats([episode_stats(store, ids) for ids in clients])
     whole = episode_stats(store, [episode_id for ids in clients for episode_id in ids])
@@ -141,7 +143,9 @@ def test_an_epoch_visits_every_frame_once_in_an_order_of_its_own(store):
         np.testing.assert_array_equal(np.sort(epoch), frame_rows(store, [0, 3]))
     assert not np.array_equal(visited[0], visited[1])
     over_the_end = count // 7  # this batch holds the end of one epoch and the start of the next
-    assert torch.equal(batches.at(over_the_end)[STATE_KEY], torch.from_numpy(store.states[visited.ravel()[7 * over_the_end :][:7]]))
+    assert torch.equal(
+        batches.at(over_the_end)[STATE_KEY], torch.from_numpy(store.states[visited.ravel()[7 * over_the_end :][:7]])
+    )
 
 
 @pytest.mark.integration

@@ -87,7 +87,7 @@ def test_an_unknown_task_is_named_with_the_valid_ones():
 @pytest.mark.slow
 def test_lerobot_eval_runs_a_saved_policy(tmp_path):
     """The command of the documentation, on a nano SmolVLA with random weights."""
-    config = configs.from_profile("tiny", num_threads=1)
+    config = configs.from_profile("tiny", base="nano", num_threads=1)
     stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY, ACTION_KEY)}
     model.save_policy(model.load_policy(config, stats), tmp_path / "policy")
     command = [
@@ -97,7 +97,7 @@ def test_lerobot_eval_runs_a_saved_policy(tmp_path):
         f"--output_dir={tmp_path / 'out'}",
     ]  # fmt: skip
     settings = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=settings)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=tmp_path, env=settings)
     assert done.returncode == 0, done.stderr[-2000:]
     results = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     assert results["overall"]["n_episodes"] == 1

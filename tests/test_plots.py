@@ -105,7 +105,7 @@ def test_likeness_shows_distances_and_the_level_of_another_episode():
 def test_partitions_and_their_heterogeneity_show_what_they_are_given():
     counts = pd.DataFrame({"lift": [3, 0], "push": [1, 4]}, index=[0, 1])
     axes = plots.client_counts_grid({"even": counts, "odd": counts})
-    assert [ax.get_title() for ax in axes] == ["even", "odd"] and axes[0].get_legend() is not None
+    assert [ax.get_title() for ax in axes] == ["even", "odd"] and len(axes[0].figure.legends) == 1
     table = pd.DataFrame({"alpha": [0.1, 0.1, 1.0, 1.0], "total_variation": [0.6, 0.4, 0.2, 0.4]})
     ax = plots.heterogeneity(table, bounds={"one task a client": 2 / 3})
     np.testing.assert_allclose(ax.lines[1].get_ydata(), [0.5, 0.3])
@@ -155,3 +155,74 @@ def test_arms_and_their_differences_keep_their_intervals():
     segment = ax.containers[0].lines[2][0].get_segments()[0]
     np.testing.assert_allclose(segment[:, 0], [10, 50])
     assert labelled(ax) and ax.get_yticklabels()[0].get_text() == "federated − base"
+
+
+def test_model_bars_show_counts_and_what_trains():
+    table = pd.DataFrame({"part": ["eye", "hand"], "parameters": [2_000_000, 500_000], "trainable": [0, 500_000]})
+    ax = plots.module_bars(table)
+    assert [bar.get_width() for bar in ax.patches] == [0, 0.5, 2.0, 0]
+    assert [text.get_text() for text in ax.texts] == ["2,000,000", "500,000"] and labelled(ax)
+    ax = plots.trainable_bars({"all": table.assign(trainable=table.parameters), "hand only": table})
+    assert [bar.get_width() for bar in ax.patches] == [2.0, 0, 0.5, 0.5] and labelled(ax)
+
+
+def test_flow_draws_a_line_per_time_and_the_goal():
+    points = np.arange(12.0).reshape(3, 4)
+    ax = plots.flow(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4))
+    np.testing.assert_allclose([line.get_ydata() for line in ax.lines], [*points, np.zeros(4)])
+    assert labelled(ax)
+
+
+def test_padding_rate_and_errors_are_labelled_and_drawn_as_given():
+    masks = np.array([[False, True], [True, True]])
+    ax = plots.padding(masks)
+    np.testing.assert_array_equal(ax.images[0].get_array(), masks)
+    assert labelled(ax) and [text.get_text() for text in ax.get_yticklabels()] == ["2", "1"]
+    ax = plots.learning_rate([0.1, 0.2])
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [0.1, 0.2])
+    assert labelled(ax)
+    errors = pd.DataFrame({"a": range(6), "b": range(6)}, index=plots.JOINT_NAMES)
+    ax = plots.error_by_joint(errors)
+    assert [bar.get_height() for bar in ax.patches] == [*range(6), *range(6)]
+    assert labelled(ax) and "[deg]" in ax.get_xticklabels()[0].get_text()
+
+
+def test_loss_and_success_skips_rounds_without_rollouts():
+    table = pd.DataFrame(
+        {
+            "round": [0, 1, 2],
+            "loss": [2.0, 1.5, 1.0],
+            "success_rate": [0.0, np.nan, 0.5],
+            "low": [0.0, np.nan, 0.2],
+            "high": [0.3, np.nan, 0.8],
+        }
+    )
+    above, below = plots.loss_and_success(table, "round", xlabel="round")
+    assert list(above.lines[0].get_ydata()) == [2.0, 1.5, 1.0]
+    assert list(below.lines[0].get_xdata()) == [0, 2]
+    assert below.get_xlabel() == "round" and above.get_ylabel() and below.get_ylabel()
+
+
+def test_rollout_grid_has_a_square_for_each_client_and_round():
+    rows = pd.DataFrame(
+        {"who": ["a", "a", "b"], "round": [1, 2, 2], "task": ["lift", "lift", "push"], "success": [True, False, False]}
+    )
+    ax = plots.rollout_grid(rows)
+    assert [text.get_text() for text in ax.texts] == ["lift\n1/1", "lift\n0/1", "push\n0/1"]
+    assert len(ax.patches) == 3 and labelled(ax)
+
+
+def test_how_much_rollouts_tell():
+    widths = pd.DataFrame({"n": [10, 100], "width": [0.5, 0.2], "success_rate": [0.5, 0.5]})
+    ax = plots.interval_width(widths)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [50, 20])
+    assert labelled(ax)
+    ax = plots.power(pd.DataFrame({"n": [10, 100], "power": [0.1, 0.9], "difference": [0.1, 0.1]}))
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [0.1, 0.9])
+    assert labelled(ax)
+
+
+def test_trajectories_of_different_length_share_the_clock():
+    axes = plots.trajectories({"expert": np.zeros((11, 6)), "policy": np.ones((21, 6))})
+    assert len(axes) == 6
+    assert [line.get_xdata()[-1] for line in axes[0].lines] == pytest.approx([1.0, 2.0])

@@ -94,29 +94,3 @@ def test_bibliography_holds_what_is_cited_and_nothing_else():
 def test_licence_is_whole():
     text = (ROOT / "LICENSE").read_text()
     assert "Apache License" in text and "END OF TERMS AND CONDITIONS" in text
-
-
-FENCES = {  # a heavy package and the modules that may import it
-    "mujoco": {"sim", "expert", "scene"},
-    "mink": {"expert"},
-    "matplotlib": {"plots"},
-    "statsmodels": {"compare"},
-}
-
-
-@pytest.mark.parametrize("package", FENCES)
-def test_heavy_packages_stay_behind_their_fence(package):
-    pattern = re.compile(rf"^\s*(?:import|from) {package}\b", flags=re.MULTILINE)
-    importers = {path.stem for path in (ROOT / "fedvla_lib").glob("*.py") if pattern.search(path.read_text())}
-    assert importers <= FENCES[package] | {"doctor"}
-
-
-def test_nothing_in_the_library_imports_the_apps_but_the_engine():
-    pattern = re.compile(r"\b(client_app|server_app)\b")
-    importers = {
-        path.stem
-        for path in (ROOT / "fedvla_lib").glob("*.py")
-        for line in path.read_text().splitlines()
-        if line.strip().startswith(("import ", "from ")) and pattern.search(line)
-    }
-    assert importers <= {"engine"}

@@ -41,8 +41,9 @@ def test_settings_and_stamp_read_back(tmp_path):
 
 def test_the_hash_follows_what_is_computed_not_where():
     config = from_profile("tiny")
-    assert run_folder.config_hash(config) == run_folder.config_hash(from_profile("tiny", out="elsewhere", num_threads=3))
-    assert run_folder.config_hash(config) != run_folder.config_hash(from_profile("tiny", seed=1))
+    moved, changed = from_profile("tiny", out="elsewhere", num_threads=3), from_profile("tiny", seed=1)
+    assert run_folder.config_hash(config) == run_folder.config_hash(moved)
+    assert run_folder.config_hash(config) != run_folder.config_hash(changed)
 
 
 def test_events_become_columns(tmp_path):

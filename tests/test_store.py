@@ -125,7 +125,11 @@ def write_foreign(root: Path, *, cameras: tuple[str, ...] = ("top", "wrist"), na
         for step in range(length):
             picture = np.full((48, 64, 3), 10 * step + 100 * episode, np.uint8)
             values = np.full(len(names), step, np.float32)
-            frame = {STATE_KEY: values, ACTION_KEY: values + 1, "task": ("Stack the blocks.", "Lift the red cube.")[episode]}
+            frame = {
+                STATE_KEY: values,
+                ACTION_KEY: values + 1,
+                "task": ("Stack the blocks.", "Lift the red cube.")[episode],
+            }
             dataset.add_frame({**frame, **{image_key(name): picture for name in cameras}})
         dataset.save_episode()
     dataset.finalize()

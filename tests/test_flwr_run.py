@@ -1,0 +1,57 @@
+"""`flwr run` for real: a SuperLink, Flower's simulation runtime with its Ray workers, and this app."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fedvla_lib import run_folder, superlink
+from fedvla_lib.config import from_profile, from_run_config
+
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
+PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
+
+
+@pytest.fixture
+def tiny(recording, tmp_path):
+    return from_profile(
+        "tiny",
+        base="nano",
+        data=str(recording),
+        num_server_rounds=1,
+        local_steps=1,
+        eval_rollouts=0,
+        client_rollouts=1,
+        num_threads=1,
+        out=str(tmp_path / "outputs"),
+    )
+
+
+def test_three_clients_one_round_on_the_simulation_runtime(tiny):
+    before = PYPROJECT.read_bytes()
+    root = superlink.run_simulation(tiny, timeout_s=540)
+    stamp = run_folder.read_stamp(root)
+    assert (stamp["status"], stamp["engine"]) == ("completed", "flower")
+    assert run_folder.read_config(root) == tiny
+    assert set(run_folder.read_metrics(root, "train").who) == {"client_0", "client_1", "client_2"}
+    assert run_folder.read_metrics(root, "rejected").empty
+    assert (root / "global_model/round_1/model.safetensors").is_file()
+    videos = run_folder.read_metrics(root, "rollout").set_index("who").video
+    assert sorted(videos.index) == ["client_0", "client_1", "client_2"]
+    assert all((root / video).stat().st_size > 1000 for video in videos)
+    assert PYPROJECT.read_bytes() == before
+
+
+def test_a_failed_run_is_an_error_with_flowers_reason(tiny):
+    with pytest.raises(superlink.FlowerRunError, match="finished:failed.*no data set at"):
+        superlink.run_simulation(replace(tiny, data="nowhere/at/all"), timeout_s=300)
+
+
+@pytest.mark.unit
+def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path):
+    app = superlink.stage_app(tmp_path / "stage")
+    assert (app / "fedvla_lib/server_app.py").is_file()
+    assert not list(app.rglob("__pycache__"))
+    settings = superlink.write_settings(tmp_path, tiny).read_text()
+    assert from_run_config(tomllib.loads(settings)) == tiny
