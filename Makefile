@@ -1,6 +1,6 @@
 # make book   build the book: environment, data, every chapter, HTML      make doctor  what is missing on this machine
 # make test   run everything that guards it                               make lab     open the notebooks
-# make data   record the demonstrations only                              make lock    pin the dependencies anew
+# make data   record, and train the warm start                            make lock    pin the dependencies anew
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -32,6 +32,7 @@ export FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION := 1
 export RAY_USAGE_STATS_ENABLED := 0
 export TOKENIZERS_PARALLELISM := false
 export PYTHONHASHSEED := 0
+export PYTHONDONTWRITEBYTECODE :=
 export IPYTHONDIR := $(CURDIR)/.cache/ipython
 export JUPYTER_CONFIG_DIR := $(CURDIR)/.cache/jupyter/config
 export JUPYTER_DATA_DIR := $(CURDIR)/.cache/jupyter/data
@@ -75,6 +76,7 @@ doctor: $(STAMP)
 
 data: $(STAMP)
 	$(BIN)/fedvla record
+	$(BIN)/fedvla warm-start
 
 # Records the demonstrations first, unless no chapter has to be executed.
 book: doctor

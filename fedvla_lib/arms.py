@@ -1,18 +1,24 @@
 """The four ways of training that the book compares, on the same data, from the same start, at equal gradient steps.
 
-``base`` is the start itself; ``local-only`` is one client on its own episodes; ``federated`` is Flower's FedAvg over all
-clients; ``centralized`` pools the clients' training episodes. Results are kept in the cache and found again by settings and
-by the library's own code, so that a change of either trains anew.
+``base`` is the start itself; ``local-only`` is one client on its own episodes; ``federated`` is Flower's FedAvg over
+all clients; ``centralized`` pools the clients' training episodes. Results are kept in the cache and found again by
+settings and by the code that decides them, so that a change of either trains anew.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
+from fedvla_lib import clients, data, engine, model, prefix, run_folder, warm_start, wire
 from fedvla_lib.clients import Client, Share
 from fedvla_lib.config import Config, cache_dir, code_digest
 from fedvla_lib.train import local_train
+
+# Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
+TRAINED_BY = (
+    *warm_start.TRAINED_BY, "config", "prefix", "partition", "params", "clients", "client_app", "server_app",
+    "strategies", "roster", "wire", "evaluate", "engine", "arms",
+)  # fmt: skip
 
 
 def steps_per_client(config: Config) -> int:
@@ -26,7 +32,7 @@ def total_steps(config: Config) -> int:
 
 
 def federated(config: Config, progress: bool = True) -> Path:
-    """Return the folder of a completed federated run with these settings, running it in this process if there is none."""
+    """Return the folder of a completed run with these settings, running it in this process if there is none."""
     out = cache_dir() / "runs" / _key(config)
     for folder in sorted(out.glob("*/")):
         if run_folder.read_stamp(folder)["status"] == "completed":
@@ -89,4 +95,4 @@ def _pooled_stats(config: Config) -> str:
 
 def _key(config: Config) -> str:
     """Identify settings and code: a model trained by older code must not pass for a result of this one."""
-    return f"{run_folder.config_hash(config)}-{code_digest()}"
+    return f"{run_folder.config_hash(config)}-{code_digest(*TRAINED_BY)}"

@@ -51,6 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _command(commands, "doctor", doctor, "check what this machine lacks to run the book")
     _add_record(commands)
+    _add_warm_start(commands)
     _add_experts(commands)
     _add_settings(_command(commands, "config", config, "print the settings as TOML for flwr run --run-config"))
     _add_train(commands)
@@ -77,6 +78,12 @@ def _add_record(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default: the chapters' cache)")
     parser.add_argument("--image-size", type=int, metavar="PIXELS", help="side of the camera images")
     parser.add_argument("--seed", type=int, help="fixes every episode")
+
+
+def _add_warm_start(commands: Any) -> None:
+    kept = "checkpoints are kept, the same command continues"
+    text = "train the model that federations begin with, unless it is in the cache"
+    _add_settings(_command(commands, "warm-start", warm_start, text, kept))
 
 
 def _add_experts(commands: Any) -> None:
@@ -164,6 +171,13 @@ def record(options: argparse.Namespace) -> None:
         return
     size, seed = wanted.image_size, wanted.seed
     print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, image_size=size, seed=seed))
+
+
+def warm_start(options: argparse.Namespace) -> None:
+    """Train the warm start into the cache and print the model that a federation with these settings begins with."""
+    from fedvla_lib.warm_start import resolve
+
+    print(resolve(settings(options)).base)
 
 
 def experts(options: argparse.Namespace) -> None:

@@ -26,7 +26,7 @@ class Config:
     num_clients: int = 10  # clients the episodes are partitioned over
     partition: str = "modulo"  # modulo, task or dirichlet
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
-    num_server_rounds: int = 10  # rounds of federated averaging
+    num_server_rounds: int = 8  # rounds of federated averaging
     fraction_train: float = 1.0  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
@@ -38,17 +38,17 @@ class Config:
     train_expert_only: bool = True  # keep the whole vision-language model fixed, train expert and projections
     train_state_proj: bool = False  # also train the projection of the arm's state into the prefix
     warm_steps: int = 600  # 'nano-warm': optimiser steps of its training from random weights
-    warm_episodes: int = 60  # 'nano-warm': demonstrations of lift that the server records for it
+    warm_episodes: int = 100  # 'nano-warm': demonstrations of lift that the server records for it
     warm_lr: float = 1e-3  # 'nano-warm': peak learning rate
     # local training
-    local_steps: int = 30  # optimiser steps of a client in a round
+    local_steps: int = 20  # optimiser steps of a client in a round
     batch_size: int = 32  # samples per optimiser step
     lr: float = 1e-3  # peak learning rate of AdamW; smolvla_base uses 1e-4
     warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
     checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
     # evaluation
-    eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
-    eval_rollouts: int = 5  # rollouts per task of the global model at each evaluation
+    eval_every: int = 4  # rounds between closed-loop evaluations; 0 evaluates after the last round only
+    eval_rollouts: int = 4  # rollouts per task of the global model at each evaluation
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
     action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
     # run
@@ -138,7 +138,7 @@ def cache_dir() -> Path:
 def code_digest(*modules: str) -> str:
     """Return a short hash of the source of these modules of the library (all, if none are named).
 
-    What is kept in the cache carries it in its name, so that results of older code are not taken for results of this one.
+    What is kept in the cache carries it in its name, so that results of older code do not pass for results of this.
     """
     folder = Path(__file__).parent
     files = [folder / f"{name}.py" for name in modules] or sorted(folder.glob("*.py"))
@@ -157,13 +157,17 @@ def check(config: Config) -> Config:
     )  # fmt: skip
     for name in positive:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
-    for name in ("warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed"):
+    countable = (
+        "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
+    )  # fmt: skip
+    for name in countable:
         _require(getattr(config, name) >= 0, config, name, "0 or more")
     for name in ("fraction_train", "fraction_evaluate", "val_fraction"):
         _require(0 <= getattr(config, name) <= 1, config, name, "a share from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a share above 0")
     _require(config.partition in PARTITIONS, config, "partition", f"one of {', '.join(PARTITIONS)}")
-    _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", f"at most chunk_size={config.chunk_size}")
+    most = f"at most chunk_size={config.chunk_size}"
+    _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", most)
     _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")
     return config
 

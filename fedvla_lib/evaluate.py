@@ -38,7 +38,7 @@ def evaluate(
 
     Row: task, instruction, seed, success (bool), steps, completion_time_s (of a success, else NaN), action_smoothness
     (mean absolute second difference of the joint targets, degrees per step squared; lower is smoother) and video (path
-    or None). With `videos_dir`, each rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4`` and a trajectory beside it.
+    or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4`` and a trajectory beside it.
     """
     rows = []
     with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:
@@ -111,7 +111,8 @@ def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
     with tempfile.TemporaryDirectory() as scratch:  # moving the index to the front needs a real file
         path = Path(scratch) / "video.mp4"
         with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
-            stream = container.add_stream("libx264", rate=fps, options={"crf": "20", "preset": "veryfast", "threads": "1"})
+            quality = {"crf": "20", "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
+            stream = container.add_stream("libx264", rate=fps, options=quality)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             for pixels in frames:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))

@@ -10,15 +10,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-# isort: off
-from fedvla_lib.scene import GRASP_SITE, build_arm  # before mink, which loads mujoco
 import mink
-# isort: on
-
 import numpy as np
 from tqdm import tqdm
 
 from fedvla_lib.rollout import run_episode
+from fedvla_lib.scene import GRASP_SITE, build_arm
 from fedvla_lib.sim import So100Env, from_radians, to_radians
 from fedvla_lib.spec import NUM_JOINTS, Observation
 

@@ -1,7 +1,7 @@
 """Build or load a SmolVLA policy, choose what trains, and let it drive the arm.
 
-Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: random weights on
-the nano backbone, a local `pretrained_model` folder, or a hub id such as ``lerobot/smolvla_base``.
+Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: random weights
+on the nano backbone, a local `pretrained_model` folder, or a hub id such as ``lerobot/smolvla_base``.
 """
 
 import contextlib
@@ -22,10 +22,11 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from safetensors import safe_open
 
-from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.config import Config, cache_dir, granted_threads
 from fedvla_lib.nano import ensure_nano
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
 
+POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
 VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
 
 # Statistics of one feature: {"mean", "std", "min", "max"}: float arrays (6,), {"count"}: int array (1,).
@@ -50,6 +51,7 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     Raises:
         ValueError: the base cannot be found or lacks weights, or no statistics are known.
     """
+    torch.set_num_threads(granted_threads(config))  # sums in another order differ in their last bits
     policy = _random_nano(config) if config.base == "nano" else _pretrained(config)
     policy.eval()
     if stats is None and config.base == "nano":
@@ -159,7 +161,14 @@ def _random_nano(config: Config) -> SmolVLAPolicy:
     _adapt(settings, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return SmolVLAPolicy(settings).to(config.device)
+        policy = SmolVLAPolicy(settings)
+        # The default (0.02) drowns where a patch lies in what it shows; at this scale the model learns to locate.
+        torch.nn.init.normal_(_vision_positions(policy), std=POSITION_STD)
+    return policy.to(config.device)
+
+
+def _vision_positions(policy: SmolVLAPolicy) -> torch.Tensor:
+    return policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings.position_embedding.weight
 
 
 def _pretrained(config: Config) -> SmolVLAPolicy:

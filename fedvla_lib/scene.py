@@ -7,13 +7,9 @@ package is located, not imported: importing it pulls dm_control.
 
 import os
 import shutil
-import sys
 import tempfile
 from importlib.metadata import distribution
 from pathlib import Path
-
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is first imported; its default needs a display
 
 import mujoco
 import numpy as np

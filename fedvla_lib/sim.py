@@ -16,15 +16,12 @@ import os
 import weakref
 from typing import Any
 
-# isort: off
-from fedvla_lib.scene import CUBE, GRASP_SITE, JOINTS, TIMESTEP_S, ZONE, build_scene  # sets MUJOCO_GL for the next line
-import mujoco
-# isort: on
-
 import gymnasium
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from fedvla_lib.scene import CUBE, GRASP_SITE, JOINTS, TIMESTEP_S, ZONE, build_scene
 from fedvla_lib.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.tasks import (
     CARRY_CLEARANCE_M,

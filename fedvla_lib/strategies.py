@@ -24,6 +24,7 @@ from fedvla_lib.wire import Rollouts
 
 logger = logging.getLogger(__name__)
 
+
 @dataclass(frozen=True)
 class Selection:
     """Stands for the grid where Flower's strategies ask which nodes there are, and knows only the drawn ones."""

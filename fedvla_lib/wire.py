@@ -88,9 +88,7 @@ def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
     """Return rows and the files of `folder` as a note: bytes reach the server whatever the engine."""
     files = sorted(folder.iterdir())
     named = [{**row, "video": Path(row["video"]).name} for row in rows]
-    return note(
-        rollouts=json.dumps(named), file_names=[f.name for f in files], files=[f.read_bytes() for f in files]
-    )
+    return note(rollouts=json.dumps(named), file_names=[f.name for f in files], files=[f.read_bytes() for f in files])
 
 
 def unpack_rollouts(content: RecordDict) -> Rollouts:

@@ -1,4 +1,4 @@
-"""Training on stored prefixes is training: same loss, same gradients, same weights; and only where that is legitimate."""
+"""Training on stored prefixes is training: same loss, gradients and weights; and only where that is legitimate."""
 
 from dataclasses import replace
 

@@ -63,9 +63,7 @@ def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, **
     events = Events()
     grid = InlineGrid(app, num_clients, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
-    strategy = CheckedFedAvg(
-        roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None, **options
-    )
+    strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None, **options)
     start = start or random_arrays(99)
     messages = strategy.configure_train(server_round, wire.pack_arrays(start), ConfigRecord(), grid)
     replies = grid.send_and_receive(messages)
