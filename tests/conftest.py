@@ -1,6 +1,7 @@
 """What all tests share: a quiet, offline, single-threaded process, its own cache, and one small recording."""
 
 import os
+import signal
 
 # Before the first import of torch, MuJoCo or the hub's client: each reads its variables once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -19,6 +20,11 @@ import pytest
 TASKS = ["lift", "place", "push"]
 EPISODES_PER_TASK = 4
 IMAGE_SIZE = 64
+
+
+def heed_interrupts() -> None:
+    """For a child process: what a shell starts in the background inherits that Ctrl-C is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from conftest import heed_interrupts
 
 from fedvla_lib.cli import build_parser, main, settings
 from fedvla_lib.config import Config, from_profile, from_run_config
@@ -154,7 +155,7 @@ def test_ctrl_c_keeps_complete_episodes_and_the_recording_goes_on(tmp_path):
     root = tmp_path / "demos"
     arguments = ["record", "--task", "lift", "--image-size", "64", "--out", str(root), "--episodes"]
     command = [sys.executable, "-m", "fedvla_lib.cli", *arguments, "500"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts)
     _wait_for_episodes(root, process, at_least=2)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from conftest import heed_interrupts
 from lerobot.datasets import LeRobotDataset
 
 from fedvla_lib import record as recording_module
@@ -172,7 +173,9 @@ def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same
 def test_a_killed_recording_holds_complete_episodes_and_continues_to_the_same_result(tmp_path, name):
     root, whole = tmp_path / "killed", tmp_path / "whole"
     command = f"from fedvla_lib.record import record; record(['lift'], 50, {str(root)!r}, image_size={SIZE}, seed=3)"
-    process = subprocess.Popen([sys.executable, "-c", command], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", command], stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    )
     deadline = time.monotonic() + 300
     while recording_module._num_recorded(root) < 2 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
