@@ -72,6 +72,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "eval_every": 0,
         "eval_rollouts": 1,
         "checkpoint_every": 2,
+        "num_threads": 1,  # for work this small a second thread costs more than it brings
     },
     "laptop": {},
     "gpu": {
