@@ -1,6 +1,6 @@
 # make book   build the book: environment, data, every chapter, HTML      make doctor  what is missing on this machine
 # make test   run everything that guards it                               make lab     open the notebooks
-# make data   record, and train the warm start                            make lock    pin the dependencies anew
+# make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -76,7 +76,6 @@ doctor: $(STAMP)
 
 data: $(STAMP)
 	$(BIN)/fedvla record
-	$(BIN)/fedvla warm-start
 
 # Records the demonstrations first, unless no chapter has to be executed.
 book: doctor

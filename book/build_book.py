@@ -10,6 +10,7 @@ profile. papermill executes it with the profile as an injected parameter; the ex
 
 import argparse
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -28,6 +29,8 @@ from papermill.exceptions import PapermillExecutionError
 ROOT = Path(__file__).resolve().parent.parent
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
 RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
+MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
+ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
@@ -49,7 +52,8 @@ class Chapter:
 
 def library_key(root: Path, profile: str) -> str:
     """Return a digest of everything but the notebook that a chapter's results depend on."""
-    files = sorted((root / "fedvla_lib").rglob("*.py")) + [root / "requirements.lock"]
+    library = (path for path in (root / "fedvla_lib").rglob("*") if "__pycache__" not in path.parts)
+    files = [*sorted(library), root / "requirements.lock"]
     return _digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
 
 
@@ -201,6 +205,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     wanted |= {Path("notebooks") / chapter.executed.name: chapter.executed.read_bytes() for chapter in chapters}
     if Path(RUN_TIMES) in wanted:
         wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
+    if Path(MODEL_CARD) in wanted:
+        wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
     for path, content in wanted.items():
         _write_if_changed(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
@@ -230,6 +236,44 @@ def _times_table(chapters: list[Chapter], profile: str) -> str:
     total = sum(chapter.seconds for chapter in chapters)
     head = f"\nProfile `{profile}`, {os.cpu_count()} cores.\n\n| chapter | seconds |\n|---|---:|\n"
     return head + "\n".join([*rows, f"| **together** | **{total:.0f}** |"]) + "\n"
+
+
+def _card_tables(account: dict) -> str:
+    """What was measured of the nano base, as the end of its page."""
+    recipe, stamp = account["recipe"], account["stamp"]
+    facts = {
+        "parameters": f"{account['parameters']:,}",
+        "episodes": f"{account['episodes']:,}",
+        "frames": f"{account['frames']:,}",
+        "optimiser steps": f"{recipe['steps']:,} of {recipe['batch_size']} samples, {recipe['draws']} noises each",
+        "training time": f"{account['training_seconds'] / 60:.0f} minutes on {recipe['num_threads']} core(s)",
+        "mean loss of the last 100 steps": f"{account['last_loss']:.3f}",
+        "seed": str(recipe["seed"]),
+        "made": f"{stamp['started'][:10]}, torch {stamp['versions']['torch']}, lerobot {stamp['versions']['lerobot']}",
+    }
+    made = _table(["", ""], [[name, value] for name, value in facts.items()])
+    success = _table(["task", "successes", "rate", "95 % interval"], [_rate(row, "task") for row in account["success"]])
+    told = _table(
+        ["task", "told", "successes", "rate", "95 % interval"],
+        [[row["task"], f"the {row['told']} cube", *_rate(row, "task")[1:]] for row in account["language"]],
+    )
+    return (
+        f"## The account\n\n{made}\n## Success\n\nIn the reference laboratory, on seeds that no demonstration has. "
+        "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, never seen, "
+        f"so this is what the base can do before any lab has trained.\n\n{success}\n## Does the sentence decide?\n\n"
+        "Two cubes on the table. Success is counted for one of them while the arm is told that one (right) or the "
+        f"other.\n\n{told}"
+    )
+
+
+def _rate(row: dict, name: str) -> list[str]:
+    interval = f"{row['low']:.0%} to {row['high']:.0%}"
+    return [row[name], f"{row['successes']} of {row['n']}", f"{row['success_rate']:.0%}", interval]
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def render(source: Path, output: Path) -> Path:

@@ -5,19 +5,20 @@ all clients; ``centralized`` pools the clients' training episodes. Results are k
 settings and by the code that decides them, so that a change of either trains anew.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fedvla_lib import clients, data, engine, model, prefix, run_folder, warm_start, wire
+from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
 from fedvla_lib.config import Config, cache_dir, code_digest
 from fedvla_lib.train import local_train
 
 # Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
 TRAINED_BY = (
-    *warm_start.TRAINED_BY, "config", "prefix", "partition", "params", "clients", "client_app", "server_app",
-    "strategies", "roster", "wire", "evaluate", "engine", "arms",
+    *data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train", "config", "partition", "params",
+    "clients", "client_app", "server_app", "strategies", "roster", "wire", "evaluate", "engine", "arms",
 )  # fmt: skip
 
 
@@ -94,5 +95,6 @@ def _pooled_stats(config: Config) -> str:
 
 
 def _key(config: Config) -> str:
-    """Identify settings and code: a model trained by older code must not pass for a result of this one."""
-    return f"{run_folder.config_hash(config)}-{code_digest(*TRAINED_BY)}"
+    """Identify settings, start and code: what older code or another base brought must not pass for a result of this."""
+    whole = "|".join([run_folder.config_hash(config), model.base_digest(config.base), code_digest(*TRAINED_BY)])
+    return hashlib.sha256(whole.encode()).hexdigest()[:16]

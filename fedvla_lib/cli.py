@@ -15,7 +15,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from fedvla_lib.config import PROFILES, Config, from_profile, task_names, to_run_config
+from fedvla_lib.config import PROFILES, Config, Recipe, from_profile, task_names, to_run_config
 from fedvla_lib.spec import CAMERAS, image_key
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
@@ -51,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _command(commands, "doctor", doctor, "check what this machine lacks to run the book")
     _add_record(commands)
-    _add_warm_start(commands)
+    _add_pretrain(commands)
     _add_experts(commands)
     _add_settings(_command(commands, "config", config, "print the settings as TOML for flwr run --run-config"))
     _add_train(commands)
@@ -80,10 +80,14 @@ def _add_record(commands: Any) -> None:
     parser.add_argument("--seed", type=int, help="fixes every episode")
 
 
-def _add_warm_start(commands: Any) -> None:
-    kept = "checkpoints are kept, the same command continues"
-    text = "train the model that federations begin with, unless it is in the cache"
-    _add_settings(_command(commands, "warm-start", warm_start, text, kept))
+def _add_pretrain(commands: Any) -> None:
+    kept = "episodes and checkpoints are in the cache, the same command continues"
+    parser = _command(commands, "pretrain", pretrain, "make the nano base that comes with this package again", kept)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    for field in fields(Recipe):
+        flag, text = "--" + field.name.replace("_", "-"), setting_texts(Recipe)[field.name]
+        parser.add_argument(flag, default=field.default, type=field.type, metavar=field.type.__name__.upper(),
+                            help=f"{text} (default: {field.default})")  # fmt: skip
 
 
 def _add_experts(commands: Any) -> None:
@@ -135,9 +139,9 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         group.add_argument(flag, default=argparse.SUPPRESS, help=text, **kind)
 
 
-def setting_texts() -> dict[str, str]:
-    """Return the sentence that stands behind each field of `Config` in its source."""
-    return dict(re.findall(r"^    (\w+): \w+ = .*?  # (.+)$", inspect.getsource(Config), flags=re.MULTILINE))
+def setting_texts(settings_class: type = Config) -> dict[str, str]:
+    """Return the sentence that stands behind each field of a class of settings in its source."""
+    return dict(re.findall(r"^    (\w+): \w+ = .*?  # (.+)$", inspect.getsource(settings_class), flags=re.MULTILINE))
 
 
 def settings(options: argparse.Namespace) -> Config:
@@ -173,11 +177,16 @@ def record(options: argparse.Namespace) -> None:
     print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, image_size=size, seed=seed))
 
 
-def warm_start(options: argparse.Namespace) -> None:
-    """Train the warm start into the cache and print the model that a federation with these settings begins with."""
-    from fedvla_lib.warm_start import resolve
+def pretrain(options: argparse.Namespace) -> None:
+    """Make a nano base and print how often it succeeds at what it has seen, and at what it has not."""
+    import pandas as pd
 
-    print(resolve(settings(options)).base)
+    from fedvla_lib.pretrain import pretrain as make
+    from fedvla_lib.pretrain import read_account
+
+    folder = make(Recipe(**{field.name: getattr(options, field.name) for field in fields(Recipe)}), options.out)
+    _print_table(pd.DataFrame(read_account(folder)["success"]))
+    print(folder)
 
 
 def experts(options: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fedvla_lib import data, model, partition, prefix, train, warm_start
+from fedvla_lib import data, model, partition, prefix, train
 from fedvla_lib.config import Config
 from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.tasks import TASKS
@@ -48,7 +48,7 @@ def open_frames(config: Config) -> data.FrameStore:
 
 def load_policy(config: Config, stats_text: str) -> model.Bundle:
     """Build the policy that normalises with the given statistics."""
-    return model.load_policy(warm_start.resolve(config), unpack_stats(stats_text))
+    return model.load_policy(config, unpack_stats(stats_text))
 
 
 TOOLS = Tools(open_frames, load_policy)

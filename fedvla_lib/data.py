@@ -31,7 +31,7 @@ __all__ = [
 
 Stats = dict[str, dict[str, np.ndarray]]  # feature key -> mean, std, min, max, count
 
-RECORDED_BY = ("tasks", "scene", "sim", "expert", "rollout", "record")  # a recording follows from this code
+RECORDED_BY = ("tasks", "lab", "scene", "sim", "expert", "rollout", "record")  # a recording follows from this code
 SHIFT_SHARE = 0.01  # largest random shift, as a share of the image side: 1 pixel of 96
 CONTRAST, BRIGHTNESS = 0.2, 0.1  # contrast is scaled by 1 +- 0.2, brightness moved by +- 0.1 of full scale
 ORDER_STREAM, AUGMENT_STREAM = 0, 1  # which independent random stream of a seed is meant

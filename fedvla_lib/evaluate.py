@@ -3,7 +3,9 @@
 import io
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from copy import copy
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,11 @@ import av
 import numpy as np
 from tqdm.auto import tqdm
 
-from fedvla_lib.rollout import Episode, run_episode
+from fedvla_lib.rollout import Episode, in_turn, run_episodes
 from fedvla_lib.sim import So100Env
 from fedvla_lib.spec import CAMERAS, FPS, Actor
 
+AT_ONCE = 16  # rollouts that a policy drives at the same time
 VIDEO_SCALE = 2  # whole pixels are doubled: 96 px cameras are small on a page
 FIRST_SEED = 1_000_000  # rollout seeds start here, far from the seeds of recorded demonstrations
 
@@ -43,14 +46,24 @@ def evaluate(
     rows = []
     with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:
         for task in tasks:
-            env = So100Env(task=task, image_size=image_size)
-            for seed in seeds:
-                episode = run_episode(env, actor, seed)
+            for episode in _episodes(actor, task, seeds, image_size, bar):
                 video = save_rollout(episode, Path(videos_dir)) if videos_dir else None
                 rows.append(row(episode) | {"video": str(video) if video else None})
-                bar.update()
-            env.close()
     return rows
+
+
+def _episodes(actor: Actor, task: str, seeds: Sequence[int], image_size: int, bar: tqdm) -> Iterator[Episode]:
+    """Yield an episode for each seed; an actor that can choose for many at once does."""
+    together = getattr(actor, "act_together", in_turn)
+    size = min(len(seeds), 1 if together is in_turn else AT_ONCE)
+    screen = So100Env(task, image_size)
+    envs = [screen, *(So100Env(task, image_size, screen=screen) for _ in range(1, size))]
+    with closing(screen):
+        for start in range(0, len(seeds), max(1, size)):
+            group = seeds[start : start + size]
+            actors = [actor] if size == 1 else [copy(actor) for _ in group]
+            yield from run_episodes(envs[: len(group)], actors, group, together)
+            bar.update(len(group))
 
 
 def row(episode: Episode) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from fedvla_lib.rollout import run_episode
 from fedvla_lib.scene import GRASP_SITE, build_arm
 from fedvla_lib.sim import So100Env, from_radians, to_radians
 from fedvla_lib.spec import NUM_JOINTS, Observation
+from fedvla_lib.tasks import CUBE_HALF_M, Cube, Layout
 
 OPEN, CLOSED = 34.0, 4.0  # gripper commands: wide enough for a turned cube, and firm
 FORK = 13.0  # gripper opening at which both finger tips push one face of the cube
@@ -27,6 +28,12 @@ GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
 PUSH_HEIGHT_M = 0.018
 HOVER_HEIGHT_M = 0.075
 CARRY_HEIGHT_M = 0.080
+RISE_M = 0.059  # how far the hand rises after letting go
+REACH_HEIGHT_M = 0.048
+POINT_HEIGHT_M = 0.055
+DRAG_HEIGHT_M = 0.017  # the cube stays on the table
+PULL_M = 0.032
+DRAG_RAD, NUDGE_RAD = np.deg2rad(17.0), np.deg2rad(16.0)
 LIFT_HEIGHT_M = 0.095
 SIDESTEP_M = 0.009  # open jaws come down this far towards the fixed one's side, so that neither grazes the cube
 CLOSE_STEPS = OPEN_STEPS = 4
@@ -55,15 +62,16 @@ class Expert:
     def reset(self, env: Any, seed: int) -> None:
         """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not needed."""
         sim: So100Env = env.unwrapped
-        start = self._arm.start(sim.joints)
-        self._path = _interpolate(start, PLANS[sim.task](sim, start))
+        self._offset = sim.joint_offset  # the plan is made in true angles, the arm is told its own
+        start = self._arm.start(sim.joints - self._offset)
+        self._path = _interpolate(start, PLANS[sim.task](sim.layout, start))
         self._step = 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the next joint targets, float32 (6,), LeRobot units; after the plan's end its last ones."""
         target = self._path[min(self._step, len(self._path) - 1)]
         self._step += 1
-        return self._arm.solve(target)
+        return self._arm.solve(target) + self._offset
 
 
 def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
@@ -141,14 +149,12 @@ def _move(begin: Waypoint, position_m: tuple[float, float, float], yaw_rad: floa
     return Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M)))
 
 
-def _grasp(env: So100Env, start: Waypoint) -> list[Waypoint]:
+def _grasp(start: Waypoint, cube: Cube, height_m: float = GRASP_HEIGHT_M) -> list[Waypoint]:
     """Hover over the cube, descend, close."""
-    x, y, _ = env.cube_m
-    yaw = env.layout.cube_yaw_rad
-    around = _sidestep(x, y, yaw)
-    hover = _move(start, (*around, HOVER_HEIGHT_M), yaw, OPEN)
-    down = _move(hover, (*around, GRASP_HEIGHT_M), yaw, OPEN)
-    return [hover, down, Waypoint((x, y, GRASP_HEIGHT_M), yaw, CLOSED, CLOSE_STEPS)]
+    around = _sidestep(*cube.xy_m, cube.yaw_rad)
+    hover = _move(start, (*around, HOVER_HEIGHT_M), cube.yaw_rad, OPEN)
+    down = _move(hover, (*around, height_m), cube.yaw_rad, OPEN)
+    return [hover, down, Waypoint((*cube.xy_m, height_m), cube.yaw_rad, CLOSED, CLOSE_STEPS)]
 
 
 def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
@@ -156,36 +162,83 @@ def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
     return x - SIDESTEP_M * np.sin(yaw_rad), y + SIDESTEP_M * np.cos(yaw_rad)
 
 
-def _lift_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
-    path = _grasp(env, start)
-    x, y, _ = env.cube_m
-    return [*path, _move(path[-1], (x, y, LIFT_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+def _carry(start: Waypoint, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> list[Waypoint]:
+    """Grasp the cube, carry it along an arc around the base, set it down with the hand at `height_m`, let go, rise."""
+    path = _grasp(start, cube)
+    path.append(_move(path[-1], (*cube.xy_m, CARRY_HEIGHT_M), path[-1].yaw_rad, CLOSED))
+    path += _arc(path[-1], to_xy_m, CARRY_HEIGHT_M, CLOSED)
+    path.append(_move(path[-1], (*to_xy_m, height_m), path[-1].yaw_rad, CLOSED))
+    around = _sidestep(*to_xy_m, path[-1].yaw_rad)
+    path.append(Waypoint((*around, height_m), path[-1].yaw_rad, OPEN, OPEN_STEPS))
+    return [*path, _move(path[-1], (*around, height_m + RISE_M), path[-1].yaw_rad, OPEN)]
 
 
-def _place_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
-    """Carry the cube over the zone along an arc around the base, set it down, let go, rise."""
-    path = _grasp(env, start)
-    x, y, _ = env.cube_m
-    path.append(_move(path[-1], (x, y, CARRY_HEIGHT_M), path[-1].yaw_rad, CLOSED))
-    path += _arc(path[-1], env.layout.zone_xy_m, CARRY_HEIGHT_M, CLOSED)
-    zone_x, zone_y = env.layout.zone_xy_m
-    path.append(_move(path[-1], (zone_x, zone_y, GRASP_HEIGHT_M), path[-1].yaw_rad, CLOSED))
-    around = _sidestep(zone_x, zone_y, path[-1].yaw_rad)
-    path.append(Waypoint((*around, GRASP_HEIGHT_M), path[-1].yaw_rad, OPEN, OPEN_STEPS))
-    return [*path, _move(path[-1], (*around, HOVER_HEIGHT_M), path[-1].yaw_rad, OPEN)]
-
-
-def _push_plan(env: So100Env, start: Waypoint) -> list[Waypoint]:
-    """Come down beside the cube with the jaws as a fork and sweep it along an arc into the zone."""
-    radius_m, bearing_rad = _polar(*env.cube_m[:2])
-    beside_rad = bearing_rad - FORK_GAP_M / radius_m
-    x, y = _cartesian(radius_m, beside_rad)
+def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> list[Waypoint]:
+    """Come down beside the cube with the jaws as a fork and sweep it along an arc to the given place."""
+    cube_radius_m, cube_rad = _polar(*cube.xy_m)
+    side = np.sign(bearing_rad - cube_rad)  # 1 sweeps to the left
+    beside_rad = cube_rad - side * FORK_GAP_M / cube_radius_m
     yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
-    hover = _move(start, (x, y, HOVER_HEIGHT_M), yaw_rad, FORK)
-    down = _move(hover, (x, y, PUSH_HEIGHT_M), yaw_rad, FORK)
-    radius_m, bearing_rad = _polar(*env.layout.zone_xy_m)
-    end = _cartesian(radius_m, bearing_rad - FORK_CONTACT_M / radius_m)
+    beside = _cartesian(cube_radius_m, beside_rad)
+    hover = _move(start, (*beside, HOVER_HEIGHT_M), yaw_rad, FORK)
+    down = _move(hover, (*beside, PUSH_HEIGHT_M), yaw_rad, FORK)
+    end = _cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
     return [hover, down, *_arc(down, end, PUSH_HEIGHT_M, FORK)]
+
+
+def _lift_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    path = _grasp(start, layout.cubes[0])
+    return [*path, _move(path[-1], (*layout.cube_xy_m, LIFT_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+
+
+def _place_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M)
+
+
+def _push_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m))
+
+
+def _stack_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    upper, lower = layout.cubes
+    return _carry(start, upper, lower.xy_m, GRASP_HEIGHT_M + 2 * CUBE_HALF_M)
+
+
+def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    path: list[Waypoint] = []
+    for cube, zone_xy_m in zip(layout.cubes, layout.zones_xy_m, strict=True):
+        path += _carry(path[-1] if path else start, cube, zone_xy_m, GRASP_HEIGHT_M)
+    return path
+
+
+def _reach_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cube_yaw_rad, OPEN)]
+
+
+def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
+
+
+def _grip_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return _grasp(start, layout.cubes[0])
+
+
+def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
+    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    return path + _arc(path[-1], _cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
+
+
+def _pull_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
+    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    nearer = _cartesian(radius_m - PULL_M, bearing_rad)
+    return [*path, _move(path[-1], (*nearer, DRAG_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+
+
+def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    return _sweep(start, layout.cubes[0], radius_m, bearing_rad - NUDGE_RAD)
 
 
 def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
@@ -211,4 +264,17 @@ def _cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
     return float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))
 
 
-PLANS = {"lift": _lift_plan, "place": _place_plan, "push": _push_plan}
+PLANS = {
+    "lift": _lift_plan,
+    "place": _place_plan,
+    "push": _push_plan,
+    "stack": _stack_plan,
+    "sort": _sort_plan,
+    "reach": _reach_plan,
+    "grip": _grip_plan,
+    "drag": _drag_plan,
+    "pull": _pull_plan,
+    "nudge": _nudge_plan,
+    "point_square": _point_plan,
+    "point_circle": _point_plan,
+}

@@ -1,15 +1,18 @@
 """Build or load a SmolVLA policy, choose what trains, and let it drive the arm.
 
-Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: random weights
-on the nano backbone, a local `pretrained_model` folder, or a hub id such as ``lerobot/smolvla_base``.
+Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: the pretrained
+nano model that comes with this package (`pretrain` made it), the same with random weights, a local `pretrained_model`
+folder, or a hub id such as ``lerobot/smolvla_base``.
 """
 
 import contextlib
+import hashlib
 import io
 import os
 import shutil
 import tempfile
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,9 @@ from fedvla_lib.nano import ensure_nano
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
 
 POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
+NANO, NANO_RANDOM = "nano", "nano-random"  # names of a base
+NANO_BASE = Path(__file__).parent / "nano_base"  # the pretrained nano model
+WEIGHTS_FILE = "model.safetensors"
 VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
 
 # Statistics of one feature: {"mean", "std", "min", "max"}: float arrays (6,), {"count"}: int array (1,).
@@ -52,11 +58,18 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
         ValueError: the base cannot be found or lacks weights, or no statistics are known.
     """
     torch.set_num_threads(granted_threads(config))  # sums in another order differ in their last bits
-    policy = _random_nano(config) if config.base == "nano" else _pretrained(config)
+    if stats is None and config.base == NANO_RANDOM:
+        raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
+    source = str(NANO_BASE) if config.base == NANO else config.base
+    policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
     policy.eval()
-    if stats is None and config.base == "nano":
-        raise ValueError("base='nano' has no statistics of its own: give those of the training episodes")
-    return Bundle(policy, *_processors(policy, stats, config.base))
+    return Bundle(policy, *_processors(policy, stats, source))
+
+
+def base_digest(base: str) -> str:
+    """Return a short hash of the weights that a base names, or its name where the weights are not a local file."""
+    file = (NANO_BASE if base == NANO else Path(base)) / WEIGHTS_FILE
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else base
 
 
 def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
@@ -113,31 +126,52 @@ class PolicyActor:
     def __init__(self, bundle: Bundle, seed: int = 0) -> None:
         self.bundle = bundle
         self.seed = seed
-        self._queue: deque[np.ndarray] = deque()
 
     def reset(self, env: Any, seed: int) -> None:
         """Forget the last episode and read the instruction of this one."""
-        self._queue.clear()
+        self._queue: deque[np.ndarray] = deque()
         self._instruction = env.instruction
         mixed = np.random.SeedSequence([self.seed, seed]).generate_state(1, np.uint64)[0]
         self._generator = torch.Generator().manual_seed(int(mixed >> 1))
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the next joint targets, float32 (6,): degrees, gripper 0-100."""
-        if not self._queue:
-            chunk = predict_chunk(self.bundle, _as_batch(observation, self._instruction), self._generator)
-            self._queue.extend(chunk[0, : self.bundle.policy.config.n_action_steps].numpy())
-        return self._queue.popleft()
+        return self.act_together([self], [observation])[0]
+
+    @staticmethod
+    def act_together(actors: Sequence["PolicyActor"], observations: Sequence[Observation]) -> list[np.ndarray]:
+        """Return the next joint targets of several actors with one policy; those that must look, look at once."""
+        looking = [(actor, seen) for actor, seen in zip(actors, observations, strict=True) if not actor._queue]
+        if looking:
+            bundle = looking[0][0].bundle
+            batch = _joined([_as_batch(seen, actor._instruction) for actor, seen in looking])
+            noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in looking])
+            for (actor, _), chunk in zip(looking, _denoise(bundle, batch, noise), strict=True):
+                actor._queue.extend(chunk[: bundle.policy.config.n_action_steps].numpy())
+        return [actor._queue.popleft() for actor in actors]
 
 
 def predict_chunk(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> torch.Tensor:
     """Denoise action chunks for a raw batch: float32 (B, chunk_size, 6) on the CPU, in degrees and gripper 0-100."""
+    return _denoise(bundle, batch, _noise(bundle, len(batch["task"]), generator))
+
+
+def _noise(bundle: Bundle, count: int, generator: torch.Generator) -> torch.Tensor:
     config = bundle.policy.config
+    return torch.randn((count, config.chunk_size, config.max_action_dim), generator=generator)
+
+
+def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torch.Tensor:
     inputs = {key: value for key, value in batch.items() if key not in (ACTION_KEY, "action_is_pad")}
-    size = (len(batch["task"]), config.chunk_size, config.max_action_dim)
-    noise = torch.randn(size, generator=generator).to(config.device)
+    noise = noise.to(bundle.policy.config.device)
     chunk = bundle.policy.predict_action_chunk(bundle.preprocess(inputs), noise=noise)  # (B, chunk, 6) normalised
     return bundle.postprocess(chunk)
+
+
+def _joined(batches: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Raw batches of one, as one raw batch."""
+    tensors = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0] if key != "task"}
+    return tensors | {"task": [text for batch in batches for text in batch["task"]]}
 
 
 def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
@@ -171,8 +205,7 @@ def _vision_positions(policy: SmolVLAPolicy) -> torch.Tensor:
     return policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings.position_embedding.weight
 
 
-def _pretrained(config: Config) -> SmolVLAPolicy:
-    base = config.base
+def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
     try:
         settings = PreTrainedConfig.from_pretrained(base)
         if not isinstance(settings, SmolVLAConfig):
@@ -184,7 +217,7 @@ def _pretrained(config: Config) -> SmolVLAPolicy:
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line per load
             policy = SmolVLAPolicy.from_pretrained(base, config=settings)
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
-        raise ValueError(_not_found(base, error)) from error
+        raise ValueError(_not_found(config.base, error)) from error
     _require_all_weights(policy, base)
     return policy
 
@@ -192,14 +225,14 @@ def _pretrained(config: Config) -> SmolVLAPolicy:
 def _not_found(base: str, error: Exception) -> str:
     reason = str(error).strip().splitlines()[0][:160]
     return (
-        f"base={base!r} could not be loaded ({reason}): give 'nano', a folder in LeRobot's pretrained_model format, "
-        "or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
+        f"base={base!r} could not be loaded ({reason}): give {NANO!r}, {NANO_RANDOM!r}, a folder in LeRobot's "
+        "pretrained_model format, or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
     )
 
 
 def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:
     """LeRobot only logs missing tensors; a policy that is partly random must not pass for a pretrained one."""
-    file = Path(base) / "model.safetensors"
+    file = Path(base) / WEIGHTS_FILE
     if not file.is_file():
         return  # from the hub cache: the file's place is LeRobot's business
     with safe_open(file, "pt") as weights:

@@ -24,7 +24,7 @@ from transformers import DynamicCache
 from fedvla_lib.config import cache_dir
 from fedvla_lib.data import Batches, FrameStore, frames, targets
 from fedvla_lib.model import Bundle
-from fedvla_lib.spec import ACTION_KEY
+from fedvla_lib.spec import ACTION_KEY, STATE_KEY
 
 PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and which positions are real
 BATCH = 64  # frames per forward pass while filling the store
@@ -86,6 +86,14 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
     return (squared * valid[..., None]).sum() / (valid.sum() * squared.shape[-1]).clamp_min(1)
 
 
+def repeated(batch: dict[str, Any], prefix: tuple[torch.Tensor, torch.Tensor], times: int) -> dict[str, Any]:
+    """Return the batch of `prefix`, each sample `times` times: several draws of noise for one look at the frame."""
+    rows = torch.arange(len(batch["task"])).repeat_interleave(times)
+    tensors = {key: batch[key][rows] for key in (STATE_KEY, ACTION_KEY, "action_is_pad")}
+    tasks = [batch["task"][row] for row in rows.tolist()]
+    return tensors | {"task": tasks, PREFIX_KEY: tuple(part[rows] for part in prefix)}
+
+
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
     """Return the prefixes of every frame of `store`, computing them into `folder` unless this model's are there."""
     target = folder / f"prefix-{_fingerprint(bundle, store)}"
@@ -103,7 +111,7 @@ def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> No
     real = []
     for start in tqdm(range(0, count, BATCH), desc="frozen prefixes", disable=not progress):
         rows = np.arange(start, min(start + BATCH, count))
-        stored, mask = _prefill(bundle, frames(store, rows, bundle.policy.config.chunk_size), length)
+        stored, mask = prefill(bundle, frames(store, rows, bundle.policy.config.chunk_size), length)
         if cache is None:
             shape = (count, *stored.shape[1:])
             cache = np.lib.format.open_memmap(scratch, mode="w+", dtype=np.float32, shape=shape)
@@ -116,8 +124,13 @@ def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> No
     os.replace(part, target / "real.npy")
 
 
-def _prefill(bundle: Bundle, batch: dict[str, Any], length: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Run the prefix through the frozen model: keys and values (B, layers, 2, H, L, D), real positions (B, L)."""
+def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Run images, instruction and state through the vision-language model, with gradients unless they are off.
+
+    Returns:
+        keys and values, (B, layers, 2, kv heads, L, head dim), and which positions are real, bool (B, L); instructions
+        are padded to at least `length` tokens.
+    """
     policy = bundle.policy
     inputs = bundle.preprocess({key: value for key, value in batch.items() if key != ACTION_KEY})
     images, image_masks = policy.prepare_images(inputs)
@@ -140,7 +153,7 @@ def _as_cache(stored: torch.Tensor) -> DynamicCache:
 
 
 def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
-    return torch.nn.functional.pad(tokens, (0, length - tokens.shape[1]))
+    return torch.nn.functional.pad(tokens, (0, max(0, length - tokens.shape[1])))
 
 
 def _longest(bundle: Bundle, store: FrameStore) -> int:

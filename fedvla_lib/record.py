@@ -43,7 +43,14 @@ VIDEO = {"vcodec": "h264", "pix_fmt": "yuv444p", "preset": "veryfast", "crf": 18
 
 
 def record(
-    tasks: list[str], episodes_per_task: int, root: str | Path, *, image_size: int, seed: int = 0, progress: bool = True
+    tasks: list[str],
+    episodes_per_task: int,
+    root: str | Path,
+    *,
+    image_size: int,
+    seed: int = 0,
+    jitter: float = 0.0,
+    progress: bool = True,
 ) -> Path:
     """Record successful expert episodes of `tasks` into the LeRobotDataset v3.0 folder `root`, and return it.
 
@@ -51,11 +58,12 @@ def record(
     interrupted recording and does nothing on a complete one; a larger `episodes_per_task` extends it.
 
     Args:
-        tasks: names from `tasks.TASKS`, in the order in which they alternate.
+        tasks: names from `tasks.ALL_TASKS`, in the order in which they alternate.
         episodes_per_task: demonstrations of each task.
         root: folder to write; a second process that records into it waits for the first.
         image_size: side of the square camera images in pixels, even.
         seed: fixes every episode.
+        jitter: above 0, each episode has cameras, light and colours of its own, drawn with this spread.
         progress: show a progress bar.
 
     Raises:
@@ -63,7 +71,7 @@ def record(
         RuntimeError: the expert failed with `MAX_ATTEMPTS` seeds in a row.
     """
     root = Path(root)
-    settings = _settings(tasks, episodes_per_task, image_size, seed)
+    settings = _settings(tasks, episodes_per_task, image_size, seed, jitter)
     _check_folder(root, settings)
     total = episodes_per_task * len(settings["tasks"])
     if _num_recorded(root) == total:
@@ -96,7 +104,9 @@ def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
     raise RuntimeError(f"the expert failed at task {env.task!r}, episode {index}, with {MAX_ATTEMPTS} seeds in a row")
 
 
-def _settings(tasks: list[str], episodes_per_task: int, image_size: int, seed: int) -> dict[str, Any]:
+def _settings(
+    tasks: list[str], episodes_per_task: int, image_size: int, seed: int, jitter: float
+) -> dict[str, Any]:
     """Everything that decides what an episode holds."""
     if episodes_per_task < 1 or not tasks:
         raise ValueError(f"cannot record {episodes_per_task} episodes of {tasks}: give 1 or more and at least one task")
@@ -106,6 +116,7 @@ def _settings(tasks: list[str], episodes_per_task: int, image_size: int, seed: i
         "tasks": check_tasks(tasks),
         "image_size": image_size,
         "seed": seed,
+        "jitter": jitter,
         "fps": FPS,
         "cameras": list(CAMERAS),
         "episodes_per_task": episodes_per_task,
@@ -143,7 +154,8 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
     """Record the episodes that `root` lacks; whatever ends this leaves complete episodes only."""
     _write_json(root / SETTINGS_FILE, settings)
     done = _num_recorded(root)
-    envs = {task: So100Env(task, settings["image_size"]) for task in dict.fromkeys(settings["tasks"])}
+    size, jitter = settings["image_size"], settings["jitter"]
+    envs = {task: So100Env(task, size, jitter=jitter) for task in dict.fromkeys(settings["tasks"])}
     bar = tqdm(initial=done, total=total, desc=f"recording into {root}", unit="episode", disable=not progress)
     recorder = _Recorder(root, settings["image_size"], done)
     try:

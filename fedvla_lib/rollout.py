@@ -1,11 +1,12 @@
 """The one loop in which an actor moves the arm; recording demonstrations and evaluating policies share it."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fedvla_lib.spec import FPS, NUM_JOINTS, Actor
+from fedvla_lib.spec import FPS, NUM_JOINTS, Actor, Observation
 
 if TYPE_CHECKING:
     from fedvla_lib.sim import So100Env
@@ -35,29 +36,67 @@ class Episode:
         return self.num_frames / FPS
 
 
+# Chooses an action for each of several actors that act at the same time, from what each of them sees.
+Together = Callable[[Sequence[Actor], Sequence[Observation]], Sequence[np.ndarray]]
+
+
 def run_episode(env: "So100Env", actor: Actor, seed: int) -> Episode:
     """Run `actor` in `env` from the reset with `seed` until success or the task's horizon.
 
     Raises:
         ValueError: the actor returned something else than six finite numbers.
     """
-    observation, info = env.reset(seed=seed)
-    actor.reset(env, seed)
-    seen, actions, over = [], [], False
-    while not over:
-        action = np.asarray(actor.act(observation), dtype=np.float32)
-        seen.append(observation)
-        actions.append(action)
-        observation, _, terminated, truncated, info = env.step(action)
-        over = terminated or truncated
-    sim = env.unwrapped
-    return Episode(
-        task=sim.task,
-        instruction=sim.instruction,
-        color=sim.layout.color,
-        seed=seed,
-        states=np.stack([frame["agent_pos"] for frame in seen]).reshape(-1, NUM_JOINTS),
-        actions=np.stack(actions),
-        images={camera: np.stack([frame["pixels"][camera] for frame in seen]) for camera in sim.cameras},
-        success=bool(info["is_success"]),
-    )
+    return run_episodes([env], [actor], [seed])[0]
+
+
+def in_turn(actors: Sequence[Actor], observations: Sequence[Observation]) -> list[np.ndarray]:
+    """Let each actor choose on its own."""
+    return [actor.act(observation) for actor, observation in zip(actors, observations, strict=True)]
+
+
+def run_episodes(
+    envs: Sequence["So100Env"], actors: Sequence[Actor], seeds: Sequence[int], together: Together = in_turn
+) -> list[Episode]:
+    """Run an episode in each environment, all in step, so that a model can choose for all of them at once.
+
+    Args:
+        envs: one environment, `actors` one actor and `seeds` one seed for each episode.
+        together: chooses the actions of those that are not done yet.
+    """
+    courses = [_Course(env, actor, seed) for env, actor, seed in zip(envs, actors, seeds, strict=True)]
+    while running := [course for course in courses if not course.over]:
+        actions = together([course.actor for course in running], [course.observation for course in running])
+        for course, action in zip(running, actions, strict=True):
+            course.step(np.asarray(action, dtype=np.float32))
+    return [course.episode() for course in courses]
+
+
+class _Course:
+    """An episode on its way."""
+
+    def __init__(self, env: "So100Env", actor: Actor, seed: int) -> None:
+        self.env, self.actor, self.seed = env, actor, seed
+        self.observation, _ = env.reset(seed=seed)
+        actor.reset(env, seed)
+        self.over = self._success = False
+        self._seen: list[Observation] = []
+        self._actions: list[np.ndarray] = []
+
+    def step(self, action: np.ndarray) -> None:
+        self._seen.append(self.observation)
+        self._actions.append(action)
+        self.observation, _, terminated, truncated, info = self.env.step(action)
+        self.over, self._success = terminated or truncated, bool(info["is_success"])
+
+    def episode(self) -> Episode:
+        sim = self.env.unwrapped
+        return Episode(
+            task=sim.task,
+            instruction=sim.instruction,
+            color=sim.layout.color,
+            seed=self.seed,
+            states=np.stack([frame["agent_pos"] for frame in self._seen]).reshape(-1, NUM_JOINTS),
+            actions=np.stack(self._actions),
+            images={camera: np.stack([frame["pixels"][camera] for frame in self._seen]) for camera in sim.cameras},
+            success=self._success,
+        )

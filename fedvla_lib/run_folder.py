@@ -71,7 +71,7 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
     """
     run = RunFolder(_make_folder(Path(config.out)))
     write_json(run.root / "config.json", asdict(config))
-    stamp, began = _first_stamp(config, engine), time.perf_counter()
+    stamp, began = first_stamp(config, engine), time.perf_counter()
     write_json(run.root / "stamp.json", stamp)
     status = "interrupted"
     try:
@@ -143,7 +143,8 @@ def _make_folder(out: Path) -> Path:
             raise ValueError(message) from error
 
 
-def _first_stamp(config: Config, engine: str) -> dict[str, Any]:
+def first_stamp(config: Config, engine: str) -> dict[str, Any]:
+    """Return what is known of a run when it starts: commit, settings, versions, hardware."""
     return {
         "status": "running",
         "engine": engine,

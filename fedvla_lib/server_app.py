@@ -10,7 +10,7 @@ from typing import Any
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
 
-from fedvla_lib import clients, data, model, roster, run_folder, warm_start, wire
+from fedvla_lib import clients, data, model, roster, run_folder, wire
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import evaluate, rollout_seeds, success_rate
 from fedvla_lib.params import load_arrays, shapes_of, trainable_arrays
@@ -45,9 +45,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
         ValueError: settings or data that cannot be used.
     """
     check_tasks(task_names(config))
-    # Before any client: many of them must not record the same data, or train the same warm start, at once.
-    store = tools.open_frames(config)
-    config = warm_start.resolve(config)
+    store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
     members, stats = _introduce(grid, config, run)
     bundle = model.load_policy(config, stats)
     arrays = trainable_arrays(bundle.policy)

@@ -14,6 +14,7 @@ gripper down. The closed and open ends of the gripper are the ends of its joint'
 import atexit
 import os
 import weakref
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -21,18 +22,10 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from fedvla_lib.scene import CUBE, GRASP_SITE, JOINTS, TIMESTEP_S, ZONE, build_scene
+from fedvla_lib.lab import REFERENCE, Lab, draw_lab
+from fedvla_lib.scene import CUBES, GRASP_SITE, JOINTS, TIMESTEP_S, ZONES, arrange, build_scene, cubes_of, furnish
 from fedvla_lib.spec import CAMERAS, FPS, NUM_JOINTS, Observation
-from fedvla_lib.tasks import (
-    CARRY_CLEARANCE_M,
-    COLORS,
-    CUBE_HALF_M,
-    TASKS,
-    Scene,
-    check_tasks,
-    draw_layout,
-    instruction,
-)
+from fedvla_lib.tasks import ALL_TASKS, CARRY_CLEARANCE_M, CUBE_HALF_M, Scene, check_tasks, draw_layout
 
 ENV_ID = "fedvla/So100-v0"
 ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # degrees that a joint shows when MuJoCo's angle is zero
@@ -44,17 +37,21 @@ FLUNG_SPEED_MPS = 0.10  # an untouched cube faster than this over a whole contro
 
 
 class So100Env(gymnasium.Env):
-    """One SO-100 arm, one cube, one task, two fixed cameras, controlled at 10 Hz.
+    """One SO-100 arm, one task with its cubes, two fixed cameras, controlled at 10 Hz.
 
     Observation: ``{"pixels": {camera: uint8 (size, size, 3)}, "agent_pos": float32 (6,)}``. Action: float32 (6,), the
     joint targets in the same units, clipped to the joint ranges. The reward is 1 when the task is fulfilled, which ends
     the episode; the task's horizon truncates it.
 
     Args:
-        task: lift, place or push.
+        task: a name from `tasks.ALL_TASKS`.
         image_size: side of the square camera images in pixels.
         render_mode: ``"rgb_array"`` or None; `render` returns all cameras side by side.
         cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time.
+        lab: the place: camera poses, light, colours, calibration of the arm.
+        screen: draw with this environment's renderer, which costs more to open than to use; it must show the same task
+            at the same size, and stay open.
+        jitter: above 0, every episode has a laboratory of its own, drawn with this spread; its arm is calibrated.
 
     Raises:
         ValueError: unknown task, camera or render mode, or an unusable image size.
@@ -68,6 +65,9 @@ class So100Env(gymnasium.Env):
         image_size: int = 96,
         render_mode: str | None = "rgb_array",
         cameras: tuple[str, ...] = CAMERAS,
+        lab: Lab = REFERENCE,
+        jitter: float = 0.0,
+        screen: "So100Env | None" = None,
     ) -> None:
         check_tasks([task])
         _check_view(image_size, render_mode, cameras)
@@ -75,20 +75,22 @@ class So100Env(gymnasium.Env):
         self.image_size = image_size
         self.render_mode = render_mode
         self.cameras = tuple(cameras)
-        self._max_episode_steps = TASKS[task].horizon_steps
-        self.model = build_scene(TASKS[task], image_size)
+        self.lab, self._jitter = lab, jitter
+        self._max_episode_steps = ALL_TASKS[task].horizon_steps
+        self.model = build_scene(ALL_TASKS[task], image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: _Renderer | None = None
+        self._screen = screen or self
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
         self._parts = _parts(self.model)
-        self.layout = draw_layout(TASKS[task], np.random.default_rng(0))
+        self.layout = draw_layout(ALL_TASKS[task], np.random.default_rng(0))
         self._needs_reset = True
 
     @property
     def instruction(self) -> str:
-        """The request in words, for the cube's colour in this episode."""
-        return instruction(self.task, self.layout.color)
+        """The request in words, for the cubes' colours in this episode."""
+        return self.layout.instruction
 
     @property
     def task_description(self) -> str:
@@ -97,13 +99,18 @@ class So100Env(gymnasium.Env):
 
     @property
     def joints(self) -> np.ndarray:
-        """Joint positions now, float32 (6,), LeRobot units."""
-        return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS])
+        """Joint positions as the arm reports them, float32 (6,), LeRobot units: with its calibration error."""
+        return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS]) + self.joint_offset
+
+    @property
+    def joint_offset(self) -> np.ndarray:
+        """What the arm reports minus what is true, float32 (6,), LeRobot units."""
+        return np.append(self.lab.joint_offset_deg, 0.0).astype(np.float32)
 
     @property
     def cube_m(self) -> np.ndarray:
-        """Centre of the cube in the world frame, float64 (3,)."""
-        return self.data.body(CUBE).xpos.copy()
+        """Centre of the first cube in the world frame, float64 (3,)."""
+        return self.data.body(CUBES[0]).xpos.copy()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Start an episode. `options={"color": "red"}` fixes the cube's colour; the positions come from the seed.
@@ -112,14 +119,17 @@ class So100Env(gymnasium.Env):
             ValueError: unknown colour.
         """
         super().reset(seed=seed)
-        self.layout = draw_layout(TASKS[self.task], self.np_random, (options or {}).get("color"))
+        if self._jitter:
+            self.lab = draw_lab("drawn", self.np_random, self._jitter, offsets=False)
+        self.layout = draw_layout(ALL_TASKS[self.task], self.np_random, (options or {}).get("color"))
         mujoco.mj_resetData(self.model, self.data)
+        furnish(self.model, self.lab)
         self._put_arm(HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS))
-        self._put_objects()
+        arrange(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
-        self._peak_clearance_m = 0.0
-        self._carried = self._flung = self._needs_reset = False
+        self._past = [_Past(self._cube_m(name)) for name in cubes_of(self.model)[: len(self.layout.cubes)]]
+        self._needs_reset = False
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
@@ -129,14 +139,15 @@ class So100Env(gymnasium.Env):
             ValueError: `action` is not six finite numbers.
             RuntimeError: the episode is over or never began.
         """
-        target = _check_action(action)
+        target = _check_action(action) - self.joint_offset
         if self._needs_reset:
             raise RuntimeError("the episode is over: call reset() before step()")
         low, high = self.action_space.low, self.action_space.high
         self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
         touched = self._advance()
-        task = TASKS[self.task]
-        self._streak = self._streak + 1 if task.success(self._look(touched)) else 0
+        task = ALL_TASKS[self.task]
+        first, *others = (self._look(index, touched) for index in range(len(self._past)))
+        self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
         terminated = self._streak >= task.hold_steps
         truncated = not terminated and self._step_count >= self._max_episode_steps
@@ -160,52 +171,57 @@ class So100Env(gymnasium.Env):
         self.data.qpos[:NUM_JOINTS] = radians
         self.data.ctrl[:] = radians
 
-    def _put_objects(self) -> None:
-        half_yaw = self.layout.cube_yaw_rad / 2
-        pose = (*self.layout.cube_xy_m, CUBE_HALF_M, np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw))
-        self.data.joint(CUBE).qpos[:] = pose
-        self.model.geom(CUBE).rgba[:3] = COLORS[self.layout.color]
-        if self.layout.zone_xy_m is not None:
-            self.data.mocap_pos[0] = (*self.layout.zone_xy_m, 0.0)
+    def _cube_m(self, name: str) -> tuple[float, float, float]:
+        return tuple(float(value) for value in self.data.body(name).xpos)
 
-    def _advance(self) -> bool:
-        """Simulate one control step; whether the arm touched the cube at any moment of it."""
-        touched = False
+    def _advance(self) -> set[str]:
+        """Simulate one control step; the cubes that the arm touched at any moment of it."""
+        touched = set()
         for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
-            touched = touched or bool(self._touching())
+            touched |= {name for name in CUBES[: len(self._past)] if self._touching(name)}
         mujoco.mj_forward(self.model, self.data)  # positions and contacts of the state that is shown
         return touched
 
-    def _touching(self) -> set[str]:
+    def _touching(self, cube: str) -> set[str]:
         """Parts of the arm in contact with the cube: "fixed", "moving" (the jaws) or "arm"."""
         pairs = self.data.contact.geom[: self.data.ncon]
-        cube = self.model.geom(CUBE).id
-        others = pairs[(pairs == cube).any(axis=1)]
-        return {self._parts[geom] for geom in others[others != cube]} - {""}
+        geom = self.model.geom(cube).id
+        others = pairs[(pairs == geom).any(axis=1)]
+        return {self._parts[other] for other in others[others != geom]} - {""}
 
-    def _look(self, touched_in_step: bool) -> Scene:
-        """Measure what the success predicates look at, and remember what happened on the way."""
-        parts = self._touching()
-        held = {"fixed", "moving"} <= parts
-        cube_m = self.cube_m
-        clearance_m = float(cube_m[2] - CUBE_HALF_M)
-        speed_mps = float(np.linalg.norm(self.data.joint(CUBE).qvel[:3]))
-        self._peak_clearance_m = max(self._peak_clearance_m, clearance_m)
-        self._carried |= held and clearance_m > CARRY_CLEARANCE_M
-        self._flung |= not touched_in_step and speed_mps > FLUNG_SPEED_MPS
-        offset_m = np.subtract(cube_m[:2], self.layout.zone_xy_m) if self.layout.zone_xy_m else (np.inf, np.inf)
+    def _look(self, index: int, touched_in_step: set[str]) -> Scene:
+        """Measure what the success predicates look at, for one cube, and remember what happened on the way."""
+        name, past = CUBES[index], self._past[index]
+        parts, cube_m = self._touching(name), self._cube_m(name)
+        hand_m = tuple(float(value) for value in self.data.site(GRASP_SITE).xpos)
+        held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
+        speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
+        past.peak_clearance_m = max(past.peak_clearance_m, clearance_m)
+        past.carried |= held and clearance_m > CARRY_CLEARANCE_M
+        past.flung |= name not in touched_in_step and speed_mps > FLUNG_SPEED_MPS
         return Scene(
             clearance_m=clearance_m,
-            peak_clearance_m=self._peak_clearance_m,
+            peak_clearance_m=past.peak_clearance_m,
             speed_mps=speed_mps,
-            zone_offset_m=(float(offset_m[0]), float(offset_m[1])),
+            zone_offset_m=self._from_zone(index, cube_m),
             held=held,
             touched=bool(parts),
-            carried=self._carried,
-            flung=self._flung,
-            hand_distance_m=float(np.linalg.norm(self.data.site(GRASP_SITE).xpos - cube_m)),
+            carried=past.carried,
+            flung=past.flung,
+            hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))),
+            cube_m=cube_m,
+            start_m=past.start_m,
+            hand_m=hand_m,
+            hand_zone_offset_m=self._from_zone(index, hand_m),
         )
+
+    def _from_zone(self, index: int, point_m: tuple[float, float, float]) -> tuple[float, float]:
+        """Where a point lies as seen from the centre of the zone that belongs to cube `index`."""
+        if index >= len(self.layout.zones_xy_m):
+            return np.inf, np.inf
+        x, y = np.subtract(point_m[:2], self.layout.zones_xy_m[index])
+        return float(x), float(y)
 
     def _observation(self) -> Observation:
         observation: Observation = {"agent_pos": self.joints}
@@ -214,13 +230,13 @@ class So100Env(gymnasium.Env):
         return observation
 
     def _info(self) -> dict[str, Any]:
-        return {"is_success": self._streak >= TASKS[self.task].hold_steps}
+        return {"is_success": self._streak >= ALL_TASKS[self.task].hold_steps}
 
     def _draw(self, camera: str) -> np.ndarray:
-        if self._renderer is None:
-            self._renderer = _open_renderer(self.model, self.image_size)
-        self._renderer.update_scene(self.data, camera=camera)
-        return self._renderer.render()
+        screen = self._screen
+        if screen._renderer is None:
+            screen._renderer = _open_renderer(screen.model, screen.image_size)
+        return screen._renderer.draw(self.model, self.data, camera)
 
     def _range(self) -> tuple[np.ndarray, np.ndarray]:
         limits_rad = self.model.jnt_range[:NUM_JOINTS]
@@ -236,6 +252,16 @@ class So100Env(gymnasium.Env):
         return spaces.Dict(parts)
 
 
+@dataclass
+class _Past:
+    """What happened to a cube in this episode."""
+
+    start_m: tuple[float, float, float]
+    peak_clearance_m: float = 0.0
+    carried: bool = False
+    flung: bool = False
+
+
 class _Renderer(mujoco.Renderer):
     """A renderer whose end does not harm the others of the process.
 
@@ -245,8 +271,17 @@ class _Renderer(mujoco.Renderer):
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         super().__init__(model, height, width)
+        self._view, self._options = mujoco.MjvCamera(), mujoco.MjvOption()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         # At exit MuJoCo ends its OpenGL display before Python destroys what still uses it.
         atexit.register(_close, weakref.ref(self))
+
+    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> np.ndarray:
+        """Return the picture, uint8 (height, width, 3); `model` has the meshes of the one this was opened with."""
+        self._view.fixedcamid = model.camera(camera).id
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._options, None, self._view, everything, self.scene)
+        return self.render()
 
     def close(self) -> None:
         if self._gl_context:
@@ -309,7 +344,7 @@ def _check_view(image_size: int, render_mode: str | None, cameras: tuple[str, ..
 def _parts(model: mujoco.MjModel) -> list[str]:
     """For every geom, the part of the arm it belongs to: "fixed", "moving", "arm", or "" for what is not the arm."""
     jaws = {"Fixed_Jaw": "fixed", "Moving_Jaw": "moving"}
-    others = {"world": "", CUBE: "", ZONE: ""}
+    others = dict.fromkeys(("world", *CUBES, *ZONES), "")
     bodies = [model.body(body).name for body in model.geom_bodyid]
     return [jaws.get(name, others.get(name, "arm")) for name in bodies]
 

@@ -32,8 +32,8 @@ def tiny(recording, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def full_run(tiny):
-    """A run with everything in it: warm start, three clients, two rounds, rollouts and videos after the last."""
-    return engine.run_inline(replace(tiny, base="nano-warm", tasks="lift,push"), progress=False)
+    """A run with everything in it: three clients, two rounds, rollouts and videos after the last."""
+    return engine.run_inline(replace(tiny, tasks="lift,push"), progress=False)
 
 
 def global_weights(root: Path, round_number: int) -> dict[str, np.ndarray]:

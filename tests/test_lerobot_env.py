@@ -17,7 +17,7 @@ from fedvla_lib import model
 from fedvla_lib.expert import Expert
 from fedvla_lib.lerobot_env import So100SimConfig
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
-from fedvla_lib.tasks import COLORS, TASKS, instruction
+from fedvla_lib.tasks import COLORS, TASKS
 
 pytestmark = pytest.mark.integration
 SIZE = 32
@@ -51,7 +51,7 @@ def test_observations_arrive_under_the_policy_s_keys(lift):
 
 def test_lerobot_reads_instruction_horizon_and_frame_rate(lift):
     lift.reset(seed=[0, 1])
-    assert set(lift.call("task_description")) <= {instruction("lift", color) for color in COLORS}
+    assert set(lift.call("task_description")) <= {f"Lift the {color} cube." for color in COLORS}
     assert lift.call("_max_episode_steps") == (TASKS["lift"].horizon_steps,) * 2
     assert lift.metadata["render_fps"] == make_env_config("so100_sim").fps
 
@@ -87,7 +87,7 @@ def test_an_unknown_task_is_named_with_the_valid_ones():
 @pytest.mark.slow
 def test_lerobot_eval_runs_a_saved_policy(tmp_path):
     """The command of the documentation, on a nano SmolVLA with random weights."""
-    config = configs.from_profile("tiny", base="nano", num_threads=1)
+    config = configs.from_profile("tiny", base="nano-random", num_threads=1)
     stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY, ACTION_KEY)}
     model.save_policy(model.load_policy(config, stats), tmp_path / "policy")
     command = [

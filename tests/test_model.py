@@ -15,7 +15,7 @@ from fedvla_lib import config as configs
 from fedvla_lib import model
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY
 
-CONFIG = configs.from_profile("tiny", base="nano", num_threads=1)
+CONFIG = configs.from_profile("tiny", base="nano-random", num_threads=1)
 STATS = {key: {"mean": np.arange(6.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
 SCENE = SimpleNamespace(instruction="Lift the red cube.")
 

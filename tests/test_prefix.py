@@ -10,7 +10,7 @@ from fedvla_lib import config as configs
 from fedvla_lib import data, model, prefix, train
 from fedvla_lib.spec import CAMERAS, STATE_KEY, image_key
 
-CONFIG = configs.from_profile("tiny", base="nano", num_threads=1)
+CONFIG = configs.from_profile("tiny", base="nano-random", num_threads=1)
 
 
 def fresh(store, config=CONFIG):

@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from fedvla_lib.lab import REFERENCE, draw_lab
 from fedvla_lib.scene import decimated_meshes
 from fedvla_lib.sim import ENV_ID, HOME, So100Env, from_radians, to_radians
 from fedvla_lib.spec import CAMERAS, NUM_JOINTS
 from fedvla_lib.tasks import (
+    ALL_TASKS,
     AWAY_M,
     COLORS,
+    CUBE_HALF_M,
+    CUBES_APART_M,
     LIFT_CLEARANCE_M,
     PLACE_HALF_M,
     PUSH_RADIUS_M,
@@ -24,7 +28,6 @@ from fedvla_lib.tasks import (
     Scene,
     check_tasks,
     draw_layout,
-    instruction,
     task_of,
 )
 
@@ -39,6 +42,12 @@ def task(request):
 
 def blind(task: str) -> So100Env:
     return So100Env(task, cameras=(), render_mode=None)
+
+
+def task_text(layout, task: str) -> str:
+    """The first wording of a task, with this layout's colours."""
+    colors = [cube.color for cube in layout.cubes]
+    return TASKS[task].wordings[0].format(color=colors[0], other=colors[-1])
 
 
 def wander(env: So100Env, seed: int, steps: int = 12) -> list[np.ndarray]:
@@ -125,8 +134,9 @@ def test_color_changes_the_words_and_the_picture_but_not_the_layout(task):
     layouts, pictures = [], []
     for color in COLORS:
         observation, _ = env.reset(seed=2, options={"color": color})
-        assert env.instruction == env.task_description == instruction(task, color)
-        layouts.append((env.layout.cube_xy_m, env.layout.cube_yaw_rad, env.layout.zone_xy_m))
+        assert env.instruction == env.task_description == task_text(env.layout, task)
+        assert env.layout.color == color and len({cube.color for cube in env.layout.cubes}) == len(env.layout.cubes)
+        layouts.append(tuple((cube.xy_m, cube.yaw_rad) for cube in env.layout.cubes) + env.layout.zones_xy_m)
         pictures.append(observation["pixels"]["front"])
     assert len(set(layouts)) == 1
     assert not np.array_equal(pictures[0], pictures[1])
@@ -139,7 +149,7 @@ def test_layouts_stay_in_their_regions_and_use_every_color(task):
     low, high = TASKS[task].cube.radius_m
     assert low <= radii.min() < radii.max() <= high
     assert {layout.color for layout in layouts} == set(COLORS)
-    assert all((layout.zone_xy_m is not None) == (TASKS[task].zone is not None) for layout in layouts)
+    assert all((layout.zone_xy_m is not None) == bool(TASKS[task].zones) for layout in layouts)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -278,13 +288,106 @@ def test_every_condition_of_a_predicate_matters(name, good, spoilers):
         assert not success(scene(**{**good, **spoiler})), spoiler
 
 
+UPPER = dict(carried=True, peak_clearance_m=0.06, clearance_m=2 * CUBE_HALF_M, cube_m=(0.2, 0.0, 3 * CUBE_HALF_M))
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower"),
+    [
+        (dict(carried=False), {}),
+        (dict(touched=True), {}),
+        (dict(hand_distance_m=AWAY_M - 0.01), {}),
+        (dict(speed_mps=0.1), {}),
+        (dict(cube_m=(0.2, CUBE_HALF_M + 0.001, 3 * CUBE_HALF_M)), {}),
+        (dict(cube_m=(0.2, 0.0, 3 * CUBE_HALF_M + 0.01)), {}),
+        ({}, dict(clearance_m=0.02)),
+        ({}, dict(speed_mps=0.1)),
+        ({}, dict(touched=True)),
+    ],
+)
+def test_every_condition_of_stack_matters(upper, lower):
+    def stacked(upper, lower):
+        below = scene(cube_m=(0.2, 0.0, CUBE_HALF_M), **lower)
+        return TASKS["stack"].success(scene(others=(below,), **{**UPPER, **upper}))
+
+    assert stacked({}, {})
+    assert not stacked(upper, lower)
+
+
+def test_sort_needs_both_cubes_in_their_places():
+    sort = TASKS["sort"].success
+    assert sort(scene(**PLACED, others=(scene(**PLACED),)))
+    assert not sort(scene(**PLACED, others=(scene(**{**PLACED, "zone_offset_m": (PLACE_HALF_M, 0.0)}),)))
+    assert not sort(scene(**{**PLACED, "touched": True}, others=(scene(**PLACED),)))
+
+
+def test_two_cubes_never_start_closer_than_the_jaws_need():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        one, other = draw_layout(TASKS["sort"], rng).cubes
+        assert np.linalg.norm(np.subtract(one.xy_m, other.xy_m)) >= CUBES_APART_M and one.color != other.color
+
+
+def test_a_cube_that_an_episode_lacks_is_not_seen():
+    """Some pretraining episodes have one cube, some two, in the same scene."""
+    env = So100Env("grip", image_size=96)
+    counts = set()
+    for seed in range(12):
+        pixels = env.reset(seed=seed)[0]["pixels"]["overhead"].astype(int)
+        seen = sum(bool((pixels @ axis > 160).sum() > 5) for axis in ((2, -1, -1), (-1, 2, -1), (-1, -1, 2)))
+        counts.add(len(env.layout.cubes))
+        orange = 1  # the arm is red enough to pass for a red cube
+        assert seen - orange <= len(env.layout.cubes)
+    assert counts == {1, 2}
+
+
+# --- laboratories
+
+
+def test_a_laboratory_changes_what_is_seen_and_nothing_that_moves():
+    lab = draw_lab("elsewhere", np.random.default_rng(0))
+    here, there = So100Env("lift", image_size=SIZE), So100Env("lift", image_size=SIZE, lab=lab)
+    (one, _), (other, _) = here.reset(seed=1), there.reset(seed=1)
+    for camera in CAMERAS:
+        assert not np.array_equal(one["pixels"][camera], other["pixels"][camera])
+    assert here.layout == there.layout
+    np.testing.assert_allclose(other["agent_pos"] - one["agent_pos"], there.joint_offset, atol=1e-4)
+    target = HOME + 3
+    for _ in range(10):
+        here.step(target)
+        there.step(target + there.joint_offset)  # the same place, in the other arm's own degrees
+    np.testing.assert_allclose(here.data.qpos, there.data.qpos, atol=1e-6)
+
+
+def test_no_spread_is_the_reference_laboratory():
+    lab = draw_lab(REFERENCE.name, np.random.default_rng(0), spread=0.0)
+    assert lab == REFERENCE
+
+
+def test_jitter_furnishes_every_episode_anew_and_the_seed_decides():
+    env = So100Env("lift", image_size=SIZE, jitter=1.0)
+    labs = [env.reset(seed=seed) and env.lab for seed in (0, 1, 0)]
+    assert labs[0] == labs[2] != labs[1]
+    assert not any(any(lab.joint_offset_deg) for lab in labs)
+
+
+def test_environments_can_share_a_renderer():
+    first = So100Env("place", image_size=SIZE)
+    second = So100Env("place", image_size=SIZE, screen=first)
+    first.reset(seed=1)
+    shared = second.reset(seed=2)[0]["pixels"]
+    own = So100Env("place", image_size=SIZE).reset(seed=2)[0]["pixels"]
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(shared[camera], own[camera])
+
+
 def test_a_tossed_cube_is_not_lifted():
     env = blind("lift")
     env.reset(seed=0)
     for speed_mps in (1.0, 2.0, 3.0):
         set_cube(env, env.cube_m, (0.0, 0.0, speed_mps))
         assert not wait(env, steps=20)
-        assert env._peak_clearance_m > LIFT_CLEARANCE_M
+        assert env._past[0].peak_clearance_m > LIFT_CLEARANCE_M
 
 
 def test_a_cube_knocked_into_the_circle_is_not_pushed():
@@ -342,19 +445,20 @@ def test_bad_actions_are_named(action, named):
 def test_bad_colors_and_tasks_are_named():
     with pytest.raises(ValueError, match="red, green, blue"):
         blind("lift").reset(seed=0, options={"color": "mauve"})
-    with pytest.raises(ValueError, match="lift, place, push"):
-        check_tasks(["lift", "stack"])
-    with pytest.raises(ValueError, match="red, green, blue"):
-        instruction("lift", "mauve")
+    with pytest.raises(ValueError, match="lift, place, push, stack, sort"):
+        check_tasks(["lift", "juggle"])
 
 
 # --- words
 
 
 def test_instructions_lead_back_to_their_task():
-    for name in TASKS:
+    rng = np.random.default_rng(0)
+    for name, task in ALL_TASKS.items():
         for color in COLORS:
-            assert task_of(instruction(name, color)) == name
+            assert task_of(draw_layout(task, rng, color).instruction) == name
+    wordings = [text for task in ALL_TASKS.values() for text in task.wordings]
+    assert len(set(wordings)) == len(wordings)
     assert task_of("Fold the towel.") == "Fold the towel."
 
 

@@ -10,7 +10,7 @@ from fedvla_lib import config as configs
 from fedvla_lib import model, train
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
-CONFIG = configs.from_profile("tiny", base="nano", checkpoint_every=2, num_threads=1, train_expert_only=False)
+CONFIG = configs.from_profile("tiny", base="nano-random", checkpoint_every=2, num_threads=1, train_expert_only=False)
 STATS = {key: {"mean": np.full(6, 10.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
 
 

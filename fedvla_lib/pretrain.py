@@ -1,0 +1,167 @@
+"""How the nano base is made: the nano model learns broad skills, and an account of it is written beside its weights.
+
+SmolVLA's recipe is a vision-language model that knows the world and stays frozen while the action expert learns a task.
+The nano model knows nothing, so here all of it is trained, once, on tasks that no client will ever be asked for: reach,
+grip, drag, pull, nudge and point, with cubes of several colours, in a different light and from a slightly different
+angle in every episode. ``base = "nano"`` names the result, which comes with the package.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import asdict, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from fedvla_lib import data, model
+from fedvla_lib.compare import success_table
+from fedvla_lib.config import Config, Recipe, cache_dir, code_digest
+from fedvla_lib.evaluate import evaluate, rollout_seeds
+from fedvla_lib.run_folder import first_stamp, write_json
+from fedvla_lib.sim import So100Env
+from fedvla_lib.tasks import PRETRAINING_TASKS, TASKS
+from fedvla_lib.train import local_train
+
+CARD_FILE = "pretraining.json"
+TWO_CUBES = ("reach", "grip")  # tasks in which a second cube can stand on the table
+TRAINED_BY = (*data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train")
+
+
+def settings(recipe: Recipe) -> Config:
+    """Return the settings of a training of everything, from random weights."""
+    return replace(
+        Config(),
+        base="nano-random",
+        tasks=",".join(PRETRAINING_TASKS),
+        freeze_vision_encoder=False,
+        train_expert_only=False,
+        train_state_proj=True,
+        augment=True,
+        warmup_steps=min(100, recipe.steps // 10),
+        **{name: getattr(recipe, name) for name in SHARED},
+    )
+
+
+SHARED = ("episodes_per_task", "image_size", "batch_size", "lr", "checkpoint_every", "num_threads", "seed")
+
+
+def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
+    """Make the base and its account in the folder `out`, and return it; an interrupted call goes on where it was.
+
+    Raises:
+        FileExistsError: `out` is there already.
+    """
+    out = Path(out)
+    if out.exists():
+        raise FileExistsError(f"{out} exists already: give a folder that does not")
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    began, config, work = time.perf_counter(), settings(recipe), _work_folder(recipe)
+    recording = data.record(
+        list(PRETRAINING_TASKS),
+        recipe.episodes_per_task,
+        work / "recording",
+        image_size=recipe.image_size,
+        seed=recipe.seed,
+        jitter=recipe.jitter,
+        progress=progress,
+    )
+    store = data.open_store(recording, image_size=recipe.image_size)
+    episodes = list(store.episodes.episode_id)
+    batches = data.Batches(store, episodes, config.chunk_size, recipe.batch_size, seed=recipe.seed, augment=True)
+    bundle = model.load_policy(config, data.episode_stats(store, episodes))
+    result = local_train(
+        bundle, batches, config, steps=recipe.steps, draws=recipe.draws,
+        checkpoint_dir=work / "checkpoints", resume=True, progress=progress,
+    )  # fmt: skip
+    account = {
+        "recipe": asdict(recipe),
+        "episodes": len(episodes),
+        "frames": store.num_frames,
+        "parameters": sum(p.numel() for p in bundle.policy.parameters()),
+        "training_seconds": result.seconds,
+        "last_loss": sum(result.losses[-100:]) / len(result.losses[-100:]),
+        "success": measure(bundle, recipe, progress),
+        "language": obeys(bundle, recipe, progress),
+        "stamp": first_stamp(config, "pretrain"),
+    }
+    account["seconds"] = time.perf_counter() - began
+    with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".pretraining-") as scratch:
+        made = Path(scratch) / out.name
+        model.save_policy(bundle, made)
+        _name_backbone_here(made, bundle.policy.config.vlm_model_name)
+        write_json(made / CARD_FILE, account)
+        os.replace(made, out)
+    return out
+
+
+def _name_backbone_here(folder: Path, backbone: str) -> None:
+    """Let the saved files name the backbone that lies beside them, not where it lay on the machine that trained."""
+    for path in sorted(folder.glob("*.json")):
+        path.write_text(path.read_text().replace(json.dumps(backbone), json.dumps(model.VLM_FOLDER)))
+
+
+def measure(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list[dict[str, Any]]:
+    """Return success per task, with Wilson intervals: the pretraining tasks, then, never seen, those of the clients."""
+    tasks = [*PRETRAINING_TASKS, *TASKS]
+    actor = model.PolicyActor(bundle, recipe.seed)
+    rows = evaluate(actor, tasks, rollout_seeds(recipe.rollouts), image_size=recipe.image_size, progress=progress)
+    return success_table(pd.DataFrame(rows), ["task"]).to_dict("records")
+
+
+def obeys(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list[dict[str, Any]]:
+    """Measure whether the instruction decides: two cubes stand there, and the arm is told the right or the other one.
+
+    Success is judged for the same cube in both cases, on the same seeds.
+    """
+    actors = {"right": model.PolicyActor(bundle, recipe.seed), "other": _Misled(bundle, recipe.seed)}
+    rows = []
+    for task in TWO_CUBES:
+        seeds = _seeds_with_two_cubes(task, recipe.rollouts)
+        for told, actor in actors.items():
+            found = evaluate(actor, [task], seeds, image_size=recipe.image_size, progress=progress)
+            rows += [row | {"told": told} for row in found]
+    return success_table(pd.DataFrame(rows), ["task", "told"]).to_dict("records")
+
+
+class _Misled(model.PolicyActor):
+    """Hears the instruction with the other cube's colour in it."""
+
+    def reset(self, env: So100Env, seed: int) -> None:
+        super().reset(env, seed)
+        asked, other = (cube.color for cube in env.layout.cubes)
+        self._instruction = self._instruction.replace(asked, other)
+
+
+def _seeds_with_two_cubes(task: str, count: int) -> list[int]:
+    with closing(So100Env(task, cameras=(), render_mode=None)) as env:
+        found = (seed for seed in rollout_seeds(20 * count) if _num_cubes(env, seed) == 2)
+        return list(islice(found, count))
+
+
+def _num_cubes(env: So100Env, seed: int) -> int:
+    env.reset(seed=seed)
+    return len(env.layout.cubes)
+
+
+def _work_folder(recipe: Recipe) -> Path:
+    """Where recording and checkpoints of this recipe, trained by this code, are kept until it is done."""
+    key = json.dumps(asdict(recipe), sort_keys=True) + code_digest(*TRAINED_BY)
+    return cache_dir() / f"pretraining-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+
+
+def read_account(base: Path = model.NANO_BASE) -> dict[str, Any]:
+    """Return what was written about a base when it was made.
+
+    Raises:
+        ValueError: the folder holds no such account.
+    """
+    path = Path(base) / CARD_FILE
+    if not path.is_file():
+        raise ValueError(f"{base} holds no {CARD_FILE}: it was not made by fedvla pretrain")
+    return json.loads(path.read_text())
