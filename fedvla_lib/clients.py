@@ -14,7 +14,8 @@ import numpy as np
 from fedvla_lib import data, model, partition, prefix, train
 from fedvla_lib.config import Config
 from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
-from fedvla_lib.tasks import TASKS
+from fedvla_lib.lab import REFERENCE, Lab, labs
+from fedvla_lib.tasks import ALL_TASKS
 from fedvla_lib.wire import unpack_stats
 
 VALIDATION_STRIDE = 5  # held-out frames are taken every half second: neighbours are nearly copies
@@ -102,14 +103,17 @@ class Client:
         Seeds and the first task differ from client to client, else all would film the same scene.
         """
         held = tasks_of(self.store, self.share.train_ids)
+        own = labs_of(self.store, self.share.train_ids, self.config)
         seeds = rollout_seeds(self.config.client_rollouts, FIRST_SEED + CLIENT_SEEDS * (self.partition_id + 1))
         actor = model.PolicyActor(bundle, self.config.seed)
         rows = []
         for turn, seed in enumerate(seeds if held else []):
             task = held[(self.partition_id + turn) % len(held)]
+            where = own[turn % len(own)]
             rows += evaluate(
-                actor, [task], [seed], image_size=self.config.image_size, videos_dir=videos_dir, progress=False
-            )
+                actor, [task], [seed], image_size=self.config.image_size, labs=[where], videos_dir=videos_dir,
+                progress=False,
+            )  # fmt: skip
         return rows
 
 
@@ -175,7 +179,14 @@ def num_frames(store: data.FrameStore, episode_ids: Sequence[int]) -> int:
 def tasks_of(store: data.FrameStore, episode_ids: Sequence[int]) -> list[str]:
     """Return the simulated tasks among the given episodes, in a fixed order."""
     held = set(store.episodes.set_index("episode_id").loc[list(episode_ids), "task"])
-    return [task for task in TASKS if task in held]
+    return [task for task in ALL_TASKS if task in held]
+
+
+def labs_of(store: data.FrameStore, episode_ids: Sequence[int], config: Config) -> list[Lab]:
+    """Return the laboratories in which the given episodes were recorded."""
+    there = labs(config.num_labs, config.seed)
+    found = sorted(set(store.episodes.set_index("episode_id").loc[list(episode_ids), "lab"]))
+    return [there[int(index)] for index in found if index < len(there)] or [REFERENCE]
 
 
 def client_seed(seed: int, partition_id: int) -> int:

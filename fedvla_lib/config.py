@@ -20,11 +20,12 @@ class Config:
     tasks: str = "lift,place,push"  # task mix, comma separated; a client's rollouts use the tasks it holds
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
     image_size: int = 96  # side of the square camera images in pixels
+    num_labs: int = 1  # laboratories the demonstrations come from: cameras, light, colours and calibration differ
     val_fraction: float = 0.1  # share of episodes held out for validation, per task
     augment: bool = False  # jitter training images; off, a frozen model's view of a frame is computed once and kept
     # federation
     num_clients: int = 10  # clients the episodes are partitioned over
-    partition: str = "modulo"  # modulo, task or dirichlet
+    partition: str = "modulo"  # modulo, task, dirichlet or lab
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
     num_server_rounds: int = 8  # rounds of federated averaging
     fraction_train: float = 1.0  # share of clients that train in a round
@@ -105,7 +106,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "device": "cuda",
     },
 }
-PARTITIONS = ("modulo", "task", "dirichlet")
+PARTITIONS = ("modulo", "task", "dirichlet", "lab")
 
 
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
@@ -164,7 +165,7 @@ def code_digest(*modules: str) -> str:
 def check(config: Config) -> Config:
     """Return `config` if every value is usable, else raise ValueError naming the setting, the value and the range."""
     positive = (
-        "episodes_per_task", "image_size", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
+        "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
         "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
     )  # fmt: skip
     for name in positive:

@@ -43,10 +43,18 @@ def resolve(config: Config) -> Path | str:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
     tasks = task_names(config)
-    key = json.dumps([tasks, config.image_size, config.episodes_per_task, config.seed, code_digest(*RECORDED_BY)])
+    settings = [tasks, config.image_size, config.episodes_per_task, config.seed, config.num_labs]
+    key = json.dumps([*settings, code_digest(*RECORDED_BY)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     root = cache_dir() / "recordings" / name
-    return record(tasks, config.episodes_per_task, root, image_size=config.image_size, seed=config.seed)
+    return record(
+        tasks,
+        config.episodes_per_task,
+        root,
+        image_size=config.image_size,
+        seed=config.seed,
+        num_labs=config.num_labs,
+    )
 
 
 def split(source: FrameStore | pd.DataFrame, val_fraction: float, seed: int) -> tuple[list[int], list[int]]:

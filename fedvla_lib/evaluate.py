@@ -14,6 +14,7 @@ import av
 import numpy as np
 from tqdm.auto import tqdm
 
+from fedvla_lib.lab import REFERENCE, Lab
 from fedvla_lib.rollout import Episode, in_turn, run_episodes
 from fedvla_lib.sim import So100Env
 from fedvla_lib.spec import CAMERAS, FPS, Actor
@@ -34,25 +35,29 @@ def evaluate(
     seeds: Sequence[int],
     *,
     image_size: int,
+    labs: Sequence[Lab] = (REFERENCE,),
     videos_dir: Path | None = None,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Run one rollout per task and seed and return a row for each.
+    """Run one rollout per task and seed, the seeds in the laboratories in turn, and return a row for each.
 
-    Row: task, instruction, seed, success (bool), steps, completion_time_s (of a success, else NaN), action_smoothness
-    (mean absolute second difference of the joint targets, degrees per step squared; lower is smoother) and video (path
-    or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4`` and a trajectory beside it.
+    Row: task, instruction, seed, lab (its name), success (bool), steps, completion_time_s (of a success, else NaN),
+    action_smoothness (mean absolute second difference of the joint targets, degrees per step squared; lower is
+    smoother) and video (path or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4`` and a trajectory beside it.
     """
     rows = []
     with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:
         for task in tasks:
-            for episode in _episodes(actor, task, seeds, image_size, bar):
+            for place, episode in enumerate(_episodes(actor, task, seeds, image_size, labs, bar)):
                 video = save_rollout(episode, Path(videos_dir)) if videos_dir else None
-                rows.append(row(episode) | {"video": str(video) if video else None})
+                where = {"lab": labs[place % len(labs)].name, "video": str(video) if video else None}
+                rows.append(row(episode) | where)
     return rows
 
 
-def _episodes(actor: Actor, task: str, seeds: Sequence[int], image_size: int, bar: tqdm) -> Iterator[Episode]:
+def _episodes(
+    actor: Actor, task: str, seeds: Sequence[int], image_size: int, labs: Sequence[Lab], bar: tqdm
+) -> Iterator[Episode]:
     """Yield an episode for each seed; an actor that can choose for many at once does."""
     together = getattr(actor, "act_together", in_turn)
     size = min(len(seeds), 1 if together is in_turn else AT_ONCE)
@@ -61,6 +66,8 @@ def _episodes(actor: Actor, task: str, seeds: Sequence[int], image_size: int, ba
     with closing(screen):
         for start in range(0, len(seeds), max(1, size)):
             group = seeds[start : start + size]
+            for place, env in enumerate(envs[: len(group)], start):
+                env.lab = labs[place % len(labs)]
             actors = [actor] if size == 1 else [copy(actor) for _ in group]
             yield from run_episodes(envs[: len(group)], actors, group, together)
             bar.update(len(group))

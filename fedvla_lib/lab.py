@@ -35,6 +35,11 @@ class Lab:
 REFERENCE = Lab()
 
 
+def labs(count: int, seed: int) -> list[Lab]:
+    """Return the laboratories of a run: the reference, then others; lab k is the same however many there are."""
+    return [REFERENCE, *(draw_lab(f"lab_{k}", np.random.default_rng([seed, k])) for k in range(1, count))]
+
+
 def draw_lab(name: str, rng: np.random.Generator, spread: float = 1.0, offsets: bool = True) -> Lab:
     """Draw a laboratory.
 

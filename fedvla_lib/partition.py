@@ -30,14 +30,16 @@ def partition(
       not do: recordings alternate the tasks, so with 3 tasks and 3 clients each client would get one task.)
     - task: client k holds task ``k % num_tasks``; clients with the same task share its episodes evenly. With fewer
       clients than tasks, client k holds tasks k, k + num_clients, ...
+    - lab: client k holds the episodes of laboratory ``k % num_labs``; clients of the same laboratory are dealt its
+      episodes like cards. With fewer clients than laboratories, client k holds k, k + num_clients, ...
     - dirichlet: each task's episodes are divided in proportions drawn from Dirichlet(alpha, ..., alpha) over the
       clients (Hsu et al., arXiv:1909.06335). Small `alpha` gives few tasks a client and unequal sizes. Draws that leave
       a client without an episode are drawn again.
 
     Args:
-        table: one row per episode, with columns episode_id and task.
+        table: one row per episode, with columns episode_id, task and, for the scheme lab, lab.
         num_clients: how many lists to return.
-        scheme: modulo, task or dirichlet.
+        scheme: modulo, task, dirichlet or lab.
         seed: fixes the Dirichlet draw; the other schemes have nothing to draw.
         alpha: concentration of the Dirichlet scheme, above 0.
 
@@ -50,6 +52,8 @@ def partition(
         parts = [table["episode_id"].iloc[client::num_clients].tolist() for client in range(num_clients)]
     elif scheme == "task":
         parts = _by_task(table, num_clients)
+    elif scheme == "lab":
+        parts = _by_lab(table, num_clients)
     else:
         parts = _dirichlet(table, num_clients, seed, alpha)
     parts = [sorted(int(episode_id) for episode_id in part) for part in parts]
@@ -77,8 +81,8 @@ def check_partition(parts: Sequence[Sequence[int]], episode_ids: Iterable[int]) 
         raise ValueError(f"episode {episode_id} of client {owner[episode_id]} is not one of those to be dealt out")
 
 
-def heterogeneity(parts: Sequence[Sequence[int]], table: pd.DataFrame) -> dict[str, Any]:
-    """Measure how different the clients' task mixes are.
+def heterogeneity(parts: Sequence[Sequence[int]], table: pd.DataFrame, by: str = "task") -> dict[str, Any]:
+    """Measure how different the clients' mixes of tasks are, or of laboratories with ``by="lab"``.
 
     Client k holds n_k of n episodes, a share p_k(t) of its own being of task t; p(t) is the share among all. The total
     variation distance of client k is ``d_k = 1/2 * sum_t |p_k(t) - p(t)|``: the share of its episodes that would have
@@ -87,12 +91,13 @@ def heterogeneity(parts: Sequence[Sequence[int]], table: pd.DataFrame) -> dict[s
 
     Returns:
         ``total_variation`` (the measure), ``per_client`` (d_k), ``sizes`` (n_k), ``frames`` (per client; if `table` has
-        num_frames), ``size_imbalance`` (largest n_k over mean n_k) and ``counts`` (DataFrame: client x task, episodes).
+        num_frames), ``size_imbalance`` (largest n_k over mean n_k) and ``counts`` (DataFrame: client x task
+        or lab, episodes).
     """
     client_of = {episode_id: client for client, part in enumerate(parts) for episode_id in part}
     held = table[table["episode_id"].isin(client_of.keys())].copy()
     held["client"] = held["episode_id"].map(client_of)
-    counts = pd.crosstab(held["client"], held["task"]).reindex(range(len(parts)), fill_value=0)
+    counts = pd.crosstab(held["client"], held[by]).reindex(range(len(parts)), fill_value=0)
     sizes = counts.sum(axis=1).to_numpy()
     mixes = counts.to_numpy() / np.maximum(sizes, 1)[:, None]
     pooled = counts.to_numpy().sum(axis=0) / max(sizes.sum(), 1)
@@ -117,6 +122,8 @@ def _check_request(table: pd.DataFrame, num_clients: int, scheme: str, alpha: fl
         raise ValueError(f"unknown partition scheme {scheme!r}: choose one of {', '.join(PARTITIONS)}")
     if not 1 <= num_clients <= len(table):
         raise ValueError(f"num_clients={num_clients} is not usable: give 1 to {len(table)}, the number of episodes")
+    if scheme == "lab" and "lab" not in table:
+        raise ValueError("scheme 'lab' needs a column lab: record with num-labs above 1, or choose another scheme")
     if not alpha > 0:
         raise ValueError(f"alpha={alpha} is not usable: give a number above 0")
     if table["episode_id"].duplicated().any():
@@ -148,6 +155,16 @@ def _by_task(table: pd.DataFrame, num_clients: int) -> list[list[int]]:
         shuffle=False,
     )
     return _ids(partitioner, table, num_clients)
+
+
+def _by_lab(table: pd.DataFrame, num_clients: int) -> list[list[int]]:
+    groups = min(num_clients, table["lab"].nunique())
+    parts: list[list[int]] = [[] for _ in range(num_clients)]
+    for place, (_, episodes) in enumerate(table.groupby("lab", sort=True)):
+        holders = range(place % groups, num_clients, groups)
+        for turn, episode_id in enumerate(episodes["episode_id"]):
+            parts[holders[turn % len(holders)]].append(episode_id)
+    return parts
 
 
 def _dirichlet(table: pd.DataFrame, num_clients: int, seed: int, alpha: float) -> list[list[int]]:

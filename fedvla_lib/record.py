@@ -25,9 +25,10 @@ from lerobot.utils.utils import SuppressProgressBars, unflatten_dict
 from tqdm.auto import tqdm
 
 from fedvla_lib.expert import Expert
+from fedvla_lib.lab import labs
 from fedvla_lib.rollout import Episode, run_episode
 from fedvla_lib.sim import So100Env
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, NUM_JOINTS, STATE_KEY, image_key
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY, image_key
 from fedvla_lib.tasks import check_tasks
 
 REPO_ID = "fedvla/so100_sim"  # a name LeRobot asks for; nothing is uploaded
@@ -49,13 +50,15 @@ def record(
     *,
     image_size: int,
     seed: int = 0,
+    num_labs: int = 1,
     jitter: float = 0.0,
     progress: bool = True,
 ) -> Path:
     """Record successful expert episodes of `tasks` into the LeRobotDataset v3.0 folder `root`, and return it.
 
-    Episode i shows ``tasks[i % len(tasks)]``. What the folder already holds is kept: the same call continues an
-    interrupted recording and does nothing on a complete one; a larger `episodes_per_task` extends it.
+    Episode i shows ``tasks[i % len(tasks)]``, in laboratory ``(i // len(tasks)) % num_labs`` (`lab.labs`). What the
+    folder already holds is kept: the same call continues an interrupted recording and does nothing on a complete one; a
+    larger `episodes_per_task` extends it.
 
     Args:
         tasks: names from `tasks.ALL_TASKS`, in the order in which they alternate.
@@ -63,6 +66,7 @@ def record(
         root: folder to write; a second process that records into it waits for the first.
         image_size: side of the square camera images in pixels, even.
         seed: fixes every episode.
+        num_labs: laboratories to record in, in turn; with more than one, a column ``lab_index`` says which.
         jitter: above 0, each episode has cameras, light and colours of its own, drawn with this spread.
         progress: show a progress bar.
 
@@ -71,7 +75,7 @@ def record(
         RuntimeError: the expert failed with `MAX_ATTEMPTS` seeds in a row.
     """
     root = Path(root)
-    settings = _settings(tasks, episodes_per_task, image_size, seed, jitter)
+    settings = _settings(tasks, episodes_per_task, image_size, seed, num_labs, jitter)
     _check_folder(root, settings)
     total = episodes_per_task * len(settings["tasks"])
     if _num_recorded(root) == total:
@@ -83,11 +87,13 @@ def record(
     return root
 
 
-def features(image_size: int) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's feature table of our recordings: state, action and one square video per camera."""
+def features(image_size: int, num_labs: int = 1) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's feature table of our recordings: state, action, one square video per camera, and the lab."""
     joints = {"dtype": "float32", "shape": (NUM_JOINTS,), "names": list(JOINT_NAMES)}
     video = {"dtype": "video", "shape": (image_size, image_size, 3), "names": ["height", "width", "channels"]}
-    return {STATE_KEY: joints, ACTION_KEY: dict(joints), **{image_key(camera): dict(video) for camera in CAMERAS}}
+    lab = {LAB_KEY: {"dtype": "int64", "shape": (1,), "names": None}} if num_labs > 1 else {}
+    videos = {image_key(camera): dict(video) for camera in CAMERAS}
+    return {STATE_KEY: joints, ACTION_KEY: dict(joints), **videos, **lab}
 
 
 def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
@@ -105,7 +111,7 @@ def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
 
 
 def _settings(
-    tasks: list[str], episodes_per_task: int, image_size: int, seed: int, jitter: float
+    tasks: list[str], episodes_per_task: int, image_size: int, seed: int, num_labs: int, jitter: float
 ) -> dict[str, Any]:
     """Everything that decides what an episode holds."""
     if episodes_per_task < 1 or not tasks:
@@ -116,6 +122,7 @@ def _settings(
         "tasks": check_tasks(tasks),
         "image_size": image_size,
         "seed": seed,
+        "num_labs": num_labs,
         "jitter": jitter,
         "fps": FPS,
         "cameras": list(CAMERAS),
@@ -156,12 +163,15 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
     done = _num_recorded(root)
     size, jitter = settings["image_size"], settings["jitter"]
     envs = {task: So100Env(task, size, jitter=jitter) for task in dict.fromkeys(settings["tasks"])}
-    bar = tqdm(initial=done, total=total, desc=f"recording into {root}", unit="episode", disable=not progress)
-    recorder = _Recorder(root, settings["image_size"], done)
+    places = labs(settings["num_labs"], settings["seed"])
+    bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
+    recorder = _Recorder(root, settings, done)
     try:
         for index in range(done, total):
-            task = settings["tasks"][index % len(settings["tasks"])]
-            recorder.add(demonstrate(envs[task], index, settings["seed"]))
+            turn, which = divmod(index, len(settings["tasks"]))
+            env, lab = envs[settings["tasks"][which]], turn % len(places)
+            env.lab = places[lab]
+            recorder.add(demonstrate(env, index, settings["seed"]), lab)
             bar.update()
     except KeyboardInterrupt:
         print(f"interrupted: {_num_recorded(root)} of {total} episodes are in {root}, "
@@ -177,7 +187,8 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
 class _Recorder:
     """Writes episodes through LeRobot into a staging folder and publishes each one when its files are closed."""
 
-    def __init__(self, root: Path, image_size: int, num_recorded: int) -> None:
+    def __init__(self, root: Path, settings: dict[str, Any], num_recorded: int) -> None:
+        self._has_labs = settings["num_labs"] > 1
         self._root, self._staging, self._next = root, root / STAGING, num_recorded
         self._stats = [_stats_of(root, index) for index in range(num_recorded)]
         shutil.rmtree(self._staging, ignore_errors=True)
@@ -198,17 +209,18 @@ class _Recorder:
             self._dataset = LeRobotDataset.create(
                 **writing,
                 fps=FPS,
-                features=features(image_size),
+                features=features(settings["image_size"], settings["num_labs"]),
                 robot_type="so100",
                 data_files_size_in_mb=ONE_EPISODE_MB,
                 video_files_size_in_mb=ONE_EPISODE_MB,
             )
 
-    def add(self, episode: Episode) -> None:
+    def add(self, episode: Episode, lab: int) -> None:
         """Write one episode and publish it."""
+        where = {LAB_KEY: np.array([lab], dtype=np.int64)} if self._has_labs else {}
         with SuppressProgressBars():
             for frame in _frames(episode):
-                self._dataset.add_frame(frame)
+                self._dataset.add_frame(frame | where)
             self._dataset.save_episode()
         # LeRobot would close these files at the end of the recording; until then they have no footer.
         self._dataset.writer.close_writer()

@@ -13,6 +13,7 @@ from flwr.serverapp import Grid, ServerApp
 from fedvla_lib import clients, data, model, roster, run_folder, wire
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import evaluate, rollout_seeds, success_rate
+from fedvla_lib.lab import labs
 from fedvla_lib.params import load_arrays, shapes_of, trainable_arrays
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.strategies import CheckedFedAvg
@@ -102,6 +103,7 @@ class Judge:
             task_names(config),
             rollout_seeds(config.eval_rollouts),
             image_size=config.image_size,
+            labs=labs(config.num_labs, config.seed),
             videos_dir=self.run.videos_dir(round_number, GLOBAL),
             progress=self.progress,
         )

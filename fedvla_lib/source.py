@@ -22,7 +22,7 @@ from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, Offl
 from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from PIL import Image
 
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, NUM_JOINTS, STATE_KEY
+from fedvla_lib.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.tasks import task_of
 
 FORMAT = "v3.0"  # of LeRobotDataset
@@ -81,7 +81,7 @@ def read_source(root: Path, cameras: Mapping[str, str] | None) -> Source:
     info = _read_info(root)
     _check_features(root, info)
     files = _read_episodes(root, info)
-    states, actions = _read_rows(root, info, files)
+    states, actions, labs = _read_rows(root, info, files)
     lengths = files["length"].to_numpy()
     ends = np.cumsum(lengths)
     instructions = [tasks[0] for tasks in files["tasks"]]
@@ -93,6 +93,7 @@ def read_source(root: Path, cameras: Mapping[str, str] | None) -> Source:
             "num_frames": lengths,
             "instruction": instructions,
             "task": [task_of(text) for text in instructions],
+            "lab": labs,
         }
     )
     return Source(root, info, _map_cameras(root, info, cameras), files, episodes, states, actions)
@@ -189,10 +190,12 @@ def _parquet(path: Path, episodes: Any) -> pq.ParquetFile:
         raise DataError(f"{path} cannot be read (episode {episodes}): {error}") from error
 
 
-def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """States and actions of all episodes, float32 (N, 6) each, checked."""
+def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """States and actions of all episodes, float32 (N, 6) each, checked, and the laboratory of each episode."""
     columns = ["episode_index", "timestamp", STATE_KEY, ACTION_KEY]
-    parts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    has_labs = LAB_KEY in info["features"]
+    columns += [LAB_KEY] if has_labs else []
+    parts: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for (chunk, file), group in files.groupby(["data/chunk_index", "data/file_index"]):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
         source = _parquet(path, group["episode_index"].iloc[0])
@@ -202,9 +205,10 @@ def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[n
         table = source.read(columns=columns).to_pandas()
         for episode_id, length in zip(group["episode_index"], group["length"], strict=True):
             rows = table[table["episode_index"] == episode_id]
-            parts[episode_id] = _check_rows(path, episode_id, rows, length, info["fps"])
-    states, actions = zip(*(parts[episode_id] for episode_id in files["episode_index"]), strict=True)
-    return np.concatenate(states), np.concatenate(actions)
+            lab = int(rows[LAB_KEY].iloc[0]) if has_labs and len(rows) else 0
+            parts[episode_id] = (*_check_rows(path, episode_id, rows, length, info["fps"]), lab)
+    states, actions, labs = zip(*(parts[episode_id] for episode_id in files["episode_index"]), strict=True)
+    return np.concatenate(states), np.concatenate(actions), list(labs)
 
 
 def _check_rows(

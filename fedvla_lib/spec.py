@@ -23,6 +23,7 @@ FPS = 10  # control steps per second; also the frame rate of every recording and
 
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
+LAB_KEY = "lab_index"  # which laboratory a frame was recorded in; data sets of one laboratory lack it
 IMAGE_PREFIX = "observation.images."
 
 # A Gymnasium observation: {"pixels": {camera: uint8 (H, W, 3)}, "agent_pos": float32 (6,)}.

@@ -24,7 +24,7 @@ from fedvla_lib.config import cache_dir
 from fedvla_lib.source import Source, locate, pictures, read_source
 from fedvla_lib.spec import JOINT_NAMES
 
-STORE_VERSION = 1  # part of every store's key: raise it when the files of a store change
+STORE_VERSION = 2  # part of every store's key: raise it when the files of a store change
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class FrameStore:
     states: np.ndarray  # float32 (N, 6): joint positions, LeRobot units
     actions: np.ndarray  # float32 (N, 6): joint targets, LeRobot units
     images: dict[str, np.ndarray]  # camera -> uint8 (N, size, size, 3), memory-mapped, read-only
-    episodes: pd.DataFrame  # episode_id, start, end (rows, end excluded), num_frames, instruction, task
+    episodes: pd.DataFrame  # episode_id, start, end (rows, end excluded), num_frames, instruction, task, lab
 
     @property
     def joint_names(self) -> tuple[str, ...]:

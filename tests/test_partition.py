@@ -15,7 +15,8 @@ def episode_table(per_task: int, tasks: tuple[str, ...] = TASKS) -> pd.DataFrame
     """As a recording has it: the tasks alternate, episodes of a task have one length."""
     count = per_task * len(tasks)
     names = [tasks[i % len(tasks)] for i in range(count)]
-    return pd.DataFrame({"episode_id": range(count), "task": names, "num_frames": [30 + len(name) for name in names]})
+    frames, labs = [30 + len(name) for name in names], [i // len(tasks) % 4 for i in range(count)]
+    return pd.DataFrame({"episode_id": range(count), "task": names, "num_frames": frames, "lab": labs})
 
 
 @pytest.mark.parametrize("scheme", PARTITIONS)
@@ -65,7 +66,7 @@ def test_dirichlet_follows_its_seed_and_concentration():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"scheme": "random"}, "unknown partition scheme 'random': choose one of modulo, task, dirichlet"),
+        ({"scheme": "random"}, "unknown partition scheme 'random': choose one of modulo, task, dirichlet, lab"),
         ({"num_clients": 0}, "num_clients=0 is not usable: give 1 to 9"),
         ({"num_clients": 10}, "num_clients=10 is not usable: give 1 to 9"),
         ({"scheme": "dirichlet", "alpha": 0.0}, "alpha=0.0"),

@@ -1,0 +1,77 @@
+"""What a federation adds to its clients' own work, in wall time and in memory, in this process.
+
+    python benchmarks/federation.py
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+
+from flwr.app import Context, Message
+from flwr.clientapp import ClientApp
+from report import laptop, options, peak_memory_mb, recording, report, timed
+
+from fedvla_lib import client_app, clients, engine
+from fedvla_lib.config import Config
+
+
+def main() -> None:
+    """Measure and report; each number of clients runs in a process of its own, so that peaks do not mix."""
+    parser = options(__doc__.splitlines()[0])
+    parser.add_argument("--clients", type=int, default=10, help="clients of the larger run")
+    parser.add_argument("--rounds", type=int, default=2, help="rounds")
+    parser.add_argument("--alone", type=int, help="used by this script: run with so many clients and print the numbers")
+    chosen = parser.parse_args()
+    config = replace(laptop(chosen.profile), num_server_rounds=chosen.rounds, eval_rollouts=0, eval_every=0)
+    if chosen.alone:
+        print(json.dumps(measure(replace(config, num_clients=chosen.alone))))
+        return
+    recording(config)
+    one, whole = (in_its_own_process(count, chosen) for count in (1, chosen.clients))
+    row = {
+        "clients": chosen.clients,
+        "wall time [s]": whole["wall"],
+        "clients' training and evaluation [s]": whole["clients"],
+        "ratio of times": whole["wall"] / whole["clients"],
+        "peak memory [MB]": whole["memory"],
+        "peak memory with one client [MB]": one["memory"],
+        "ratio of memories": whole["memory"] / one["memory"],
+    }
+    report("federation", [row], chosen.out)
+
+
+def in_its_own_process(count: int, chosen: argparse.Namespace) -> dict[str, float]:
+    """Measure a federation of `count` clients."""
+    command = [sys.executable, __file__, "--alone", str(count), "--rounds", str(chosen.rounds)]
+    done = subprocess.run([*command, "--profile", chosen.profile], check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measure(config: Config) -> dict[str, float]:
+    """Run a federation; return its wall time, the time inside its clients, and the most memory held."""
+    inside: list[float] = []
+    tools = engine.remembering(clients.TOOLS)
+    with tempfile.TemporaryDirectory() as out:
+        app = Watched(client_app.build(tools), inside)
+        wall = timed(lambda: engine.run_inline(replace(config, out=out), clients_app=app, progress=False))
+    return {"wall": wall, "clients": sum(inside), "memory": peak_memory_mb()}
+
+
+class Watched:
+    """A ClientApp that notes how long each message took."""
+
+    def __init__(self, app: ClientApp, seconds: list[float]) -> None:
+        self._app, self._seconds = app, seconds
+
+    def __call__(self, message: Message, context: Context) -> Message:
+        """Handle a message."""
+        replies: list[Message] = []
+        self._seconds.append(timed(lambda: replies.append(self._app(message, context))))
+        return replies[0]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""Local training of a frozen nano model: stored prefixes against LeRobot's data set, DataLoader and policy.
+
+Both sides see the same frames in the same order and draw the same noise, so their losses must agree step by step.
+
+    python benchmarks/local_training.py
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDataset
+from report import laptop, options, recording, report, timed
+
+from fedvla_lib import data, model, prefix
+from fedvla_lib.config import Config
+from fedvla_lib.record import REPO_ID
+from fedvla_lib.spec import ACTION_KEY, FPS
+from fedvla_lib.store import FrameStore
+from fedvla_lib.train import _optimizer as make_optimizer
+
+
+def main() -> None:
+    """Measure and report."""
+    parser = options(__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=12, help="optimiser steps measured of each side")
+    parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2], help="DataLoader workers to try")
+    chosen = parser.parse_args()
+    config = laptop(chosen.profile)
+    torch.set_num_threads(1)
+    store = recording(config)
+    episodes = list(store.episodes.episode_id)
+    batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
+    stats = data.episode_stats(store, episodes)
+
+    ours = model.load_policy(config, stats)
+    kept = []
+    stored_s = timed(lambda: kept.append(prefix.stored(ours, batches)))
+    our_losses, our_s = train(ours, config, (kept[0].at(step) for step in range(chosen.steps)), chosen.steps)
+    samples = chosen.steps * config.batch_size
+    rows = []
+    for workers in chosen.workers:
+        theirs = model.load_policy(config, stats)
+        loader = lerobot_batches(store, batches, chosen.steps, workers)
+        their_losses, their_s = train(theirs, config, iter(loader), chosen.steps)
+        rows.append(
+            {
+                "lerobot workers": workers,
+                "ours [samples/s]": samples / our_s,
+                "lerobot [samples/s]": samples / their_s,
+                "ratio": their_s / our_s,
+                "largest loss difference": float(np.abs(np.subtract(our_losses, their_losses)).max()),
+                "storing the prefixes once [s]": stored_s,
+                "frames": store.num_frames,
+            }
+        )
+    report("local_training", rows, chosen.out)
+
+
+def train(bundle: model.Bundle, config: Config, batches: Iterator[dict], steps: int) -> tuple[list[float], float]:
+    """Train with the same noise on either side; return losses and seconds, the first step replaced by a usual one."""
+    optimizer, scheduler = make_optimizer(bundle, config, 0, 1000)
+    bundle.policy.train()
+    losses: list[float] = []
+    seconds = [
+        timed(lambda: losses.append(one_step(bundle, next(batches), optimizer, scheduler, len(losses))))
+        for _ in range(steps)
+    ]
+    return losses, sum(seconds[1:]) * steps / (steps - 1)
+
+
+def one_step(
+    bundle: model.Bundle, batch: dict, optimizer: torch.optim.Optimizer, scheduler: object, step: int
+) -> float:
+    """One optimiser step on a raw batch, with a stored prefix or without."""
+    generator = torch.Generator().manual_seed(step)
+    settings = bundle.policy.config
+    noise = torch.randn((len(batch["task"]), settings.chunk_size, settings.max_action_dim), generator=generator)
+    times = torch.rand(len(noise), generator=generator)
+    if prefix.PREFIX_KEY in batch:
+        loss = prefix.prefix_loss(bundle, batch, noise, times)
+    else:
+        loss = bundle.policy.forward(bundle.preprocess(batch), noise=noise, time=times)[0]
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    trainable = [p for p in bundle.policy.parameters() if p.requires_grad]
+    torch.nn.utils.clip_grad_norm_(trainable, settings.optimizer_grad_clip_norm)
+    optimizer.step()
+    scheduler.step()
+    return loss.item()
+
+
+def lerobot_batches(store: FrameStore, batches: data.Batches, steps: int, workers: int) -> torch.utils.data.DataLoader:
+    """LeRobot's own way to the same batches: decode the frames when they are asked for."""
+    chunk = [step / FPS for step in range(batches.chunk_size)]
+    dataset = LeRobotDataset(REPO_ID, root=store.root, delta_timestamps={ACTION_KEY: chunk}, video_backend="pyav")
+    order = [batches.rows_at(step).tolist() for step in range(steps)]
+    return torch.utils.data.DataLoader(dataset, batch_sampler=order, num_workers=workers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""What every benchmark shares: one recording, one table, one JSON file. No test depends on a time.
+
+Each script measures both sides in one run on one machine and prints their ratio. The speed of a machine cancels in a
+ratio; what else runs on it does not, so let nothing else run.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from fedvla_lib import data
+from fedvla_lib.config import Config, from_profile
+from fedvla_lib.run_folder import write_json
+from fedvla_lib.store import FrameStore, open_store
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def options(text: str) -> argparse.ArgumentParser:
+    """Return a parser with what all benchmarks take."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--profile", default="laptop", help="settings of model and data")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements of each side; the median counts")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the JSON file")
+    return parser
+
+
+def recording(config: Config) -> FrameStore:
+    """Return the frames of the profile's own recording, made now if it is not in the cache."""
+    return open_store(data.resolve(config), image_size=config.image_size)
+
+
+def laptop(profile: str, **overrides: object) -> Config:
+    """Return the profile's settings on one thread, so that cores are counted by processes."""
+    return from_profile(profile, **{"num_threads": 1, **overrides})
+
+
+def median_seconds(work: Callable[[], object], repeats: int) -> float:
+    """Return the median wall time of `work` over `repeats` calls, after one that does not count."""
+    work()
+    return statistics.median(timed(work) for _ in range(repeats))
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Return the wall time of one call in seconds."""
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def peak_memory_mb() -> float:
+    """Return the most memory this process has held so far, in MB (Linux counts in KiB, macOS in bytes)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if platform.system() == "Darwin" else 1e3)
+
+
+def report(name: str, rows: list[dict[str, object]], out: Path) -> None:
+    """Print the rows and keep them with the machine they were measured on."""
+    for row in rows:
+        print("  ".join(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"
+                        for key, value in row.items()))  # fmt: skip
+    machine = {"cores": cores(), "python": platform.python_version(), "system": platform.system()}
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / f"{name}.json", {"machine": machine, "rows": json.loads(json.dumps(rows))})
+    print(f"-> {name}.json")
+
+
+def cores() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

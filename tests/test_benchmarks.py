@@ -1,0 +1,48 @@
+"""The benchmarks run, and both sides of them compute the same thing; how fast is not a test's business."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fedvla_lib import model
+from fedvla_lib.config import from_profile
+
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
+FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+
+
+def run(name: str, out: Path, *arguments: str) -> list[dict]:
+    command = [sys.executable, str(FOLDER / f"{name}.py"), "--profile", "tiny", "--repeats", "1", "--out", str(out)]
+    settings = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=600, env=settings)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads((out / f"{name}.json").read_text())["rows"]
+
+
+def test_local_training_computes_what_lerobot_computes(tmp_path):
+    for row in run("local_training", tmp_path, "--steps", "3", "--workers", "0", "1"):
+        assert row["largest loss difference"] <= 1e-6
+        assert row["ours [samples/s]"] > 0 < row["lerobot [samples/s]"]
+
+
+@pytest.mark.parametrize("name", ["random_access", "control_steps"])
+def test_a_ratio_is_reported(name, tmp_path):
+    (row,) = run(name, tmp_path)
+    assert row["ratio"] > 0
+
+
+def test_a_federation_is_measured_against_its_clients(tmp_path):
+    (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
+    assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0
+    assert row["peak memory [MB]"] > 0
+
+
+def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path):
+    model.save_policy(model.load_policy(from_profile("tiny")), tmp_path / "policy")
+    arguments = ["--policy", str(tmp_path / "policy"), "--rollouts", "2", "--batch", "2"]
+    (row,) = run("rollouts", tmp_path, *arguments)
+    assert row["rollouts"] == 2 and 0 <= row["seeds that agree"] <= 2

@@ -1,0 +1,62 @@
+"""Laboratories from recording to rollout: told apart in the data, dealt to clients, and met again in evaluation."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from fedvla_lib import clients, data, evaluate, lab, model, partition
+from fedvla_lib.config import from_profile
+from fedvla_lib.store import open_store
+
+pytestmark = pytest.mark.integration
+CONFIG = from_profile("tiny", tasks="lift,push", num_labs=3, partition="lab", num_threads=1, episodes_per_task=6)
+
+
+@pytest.fixture(scope="module")
+def store():
+    return open_store(data.resolve(CONFIG), image_size=CONFIG.image_size, progress=False)
+
+
+def test_labs_do_not_depend_on_how_many_there_are():
+    assert lab.labs(3, seed=4) == lab.labs(5, seed=4)[:3] and lab.labs(1, seed=4) == [lab.REFERENCE]
+    assert len(set(lab.labs(5, seed=4))) == 5 and lab.labs(2, seed=4)[1] != lab.labs(2, seed=5)[1]
+
+
+def test_a_recording_says_in_which_laboratory_each_episode_was_made(store):
+    assert list(store.episodes.lab) == [(i // 2) % 3 for i in range(12)]
+    counts = pd.crosstab(store.episodes.lab, store.episodes.task)
+    assert (counts == 2).all().all()
+
+
+def test_laboratories_look_different_and_report_other_angles(store):
+    first = store.images["overhead"][store.episodes.start.to_numpy()].astype(float)
+    means = np.array([first[(store.episodes.lab == k).to_numpy()].mean(axis=(0, 1, 2)) for k in range(3)])
+    assert np.abs(np.diff(means, axis=0)).max() > 2  # grey levels, between the average pictures of two laboratories
+
+
+@pytest.mark.parametrize("num_clients", [2, 3, 6])
+def test_clients_get_laboratories(store, num_clients):
+    parts = partition.partition(store.episodes, num_clients, "lab")
+    held = [set(store.episodes.set_index("episode_id").lab[part]) for part in parts]
+    assert all(len(one) == (1 if num_clients >= 3 else held.index(one) == 0 and 2 or 1) for one in held)
+    mixes = [store.episodes.set_index("episode_id").task[part].value_counts() for part in parts]
+    assert all(mix["lift"] == mix["push"] for mix in mixes)
+    assert partition.heterogeneity(parts, store.episodes)["total_variation"] == 0
+    assert partition.heterogeneity(parts, store.episodes, by="lab")["total_variation"] > 0.3
+
+
+def test_a_client_acts_in_its_own_laboratory(store, tmp_path):
+    there = lab.labs(3, CONFIG.seed)
+    bundle = model.load_policy(from_profile("tiny", base="nano-random", num_threads=1), data.episode_stats(store, [0]))
+    for k in range(3):
+        client = clients.open_client(CONFIG, k)
+        assert clients.labs_of(store, client.share.train_ids, CONFIG) == [there[k]]
+        (row,) = client.roll_out(bundle, tmp_path / str(k))
+        assert row["lab"] == there[k].name
+
+
+def test_an_evaluation_visits_the_laboratories_in_turn(store):
+    bundle = model.load_policy(from_profile("tiny", base="nano-random", num_threads=1), data.episode_stats(store, [0]))
+    actor, there = model.PolicyActor(bundle), lab.labs(2, 0)
+    rows = evaluate.evaluate(actor, ["lift"], [1, 2, 3], image_size=64, labs=there, progress=False)
+    assert [row["lab"] for row in rows] == [there[0].name, there[1].name, there[0].name]
