@@ -31,6 +31,8 @@ PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", "
 RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
+SPEED = "book/speed.md"  # the page that ends with the results of the benchmarks
+BENCHMARKS = "benchmarks/results"
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
@@ -207,6 +209,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
+    if Path(SPEED) in wanted:
+        wanted[Path(SPEED)] += _benchmark_tables(root / BENCHMARKS).encode()
     for path, content in wanted.items():
         _write_if_changed(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
@@ -264,6 +268,18 @@ def _card_tables(account: dict) -> str:
         "Two cubes on the table. Success is counted for one of them while the arm is told that one (right) or the "
         f"other.\n\n{told}"
     )
+
+
+def _benchmark_tables(folder: Path) -> str:
+    """The results of the benchmarks that were kept, one section each."""
+    parts = []
+    for path in sorted(folder.glob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        rows = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in result["rows"]]
+        title = path.stem.replace("_", " ")
+        where = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
+        parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{_table(list(result['rows'][0]), rows)}")
+    return "\n".join(parts)
 
 
 def _rate(row: dict, name: str) -> list[str]:

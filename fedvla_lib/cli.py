@@ -77,6 +77,7 @@ def _add_record(commands: Any) -> None:
     parser.add_argument("--episodes", type=int, metavar="N", help="demonstrations of each task")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default: the chapters' cache)")
     parser.add_argument("--image-size", type=int, metavar="PIXELS", help="side of the camera images")
+    parser.add_argument("--num-labs", type=int, metavar="N", help="laboratories to record in, in turn (default: 1)")
     parser.add_argument("--seed", type=int, help="fixes every episode")
 
 
@@ -163,7 +164,12 @@ def record(options: argparse.Namespace) -> None:
     """Record into a folder, or into the cache where the chapters look."""
     from fedvla_lib.record import record as record_episodes
 
-    given = {"episodes_per_task": options.episodes, "image_size": options.image_size, "seed": options.seed}
+    given = {
+        "episodes_per_task": options.episodes,
+        "image_size": options.image_size,
+        "num_labs": options.num_labs,
+        "seed": options.seed,
+    }
     chosen = {name: value for name, value in given.items() if value is not None}
     if options.task:
         chosen["tasks"] = ",".join(options.task)
@@ -173,8 +179,8 @@ def record(options: argparse.Namespace) -> None:
 
         print(resolve(wanted))
         return
-    size, seed = wanted.image_size, wanted.seed
-    print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, image_size=size, seed=seed))
+    kinds = {"image_size": wanted.image_size, "seed": wanted.seed, "num_labs": wanted.num_labs}
+    print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, **kinds))
 
 
 def pretrain(options: argparse.Namespace) -> None:

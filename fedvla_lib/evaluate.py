@@ -43,7 +43,8 @@ def evaluate(
 
     Row: task, instruction, seed, lab (its name), success (bool), steps, completion_time_s (of a success, else NaN),
     action_smoothness (mean absolute second difference of the joint targets, degrees per step squared; lower is
-    smoother) and video (path or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4`` and a trajectory beside it.
+    smoother) and video (path or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4``
+    and a trajectory beside it.
     """
     rows = []
     with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:

@@ -8,14 +8,18 @@ folder, or a hub id such as ``lerobot/smolvla_base``.
 import contextlib
 import hashlib
 import io
+import json
 import os
 import shutil
 import tempfile
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import numpy as np
 import torch
@@ -30,8 +34,8 @@ from fedvla_lib.nano import ensure_nano
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
 
 POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
+PACKAGE = "fedvla-lib"
 NANO, NANO_RANDOM = "nano", "nano-random"  # names of a base
-NANO_BASE = Path(__file__).parent / "nano_base"  # the pretrained nano model
 WEIGHTS_FILE = "model.safetensors"
 VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
 
@@ -60,15 +64,44 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     torch.set_num_threads(granted_threads(config))  # sums in another order differ in their last bits
     if stats is None and config.base == NANO_RANDOM:
         raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
-    source = str(NANO_BASE) if config.base == NANO else config.base
+    source = str(nano_base()) if config.base == NANO else config.base
     policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
     policy.eval()
     return Bundle(policy, *_processors(policy, stats, source))
 
 
+def nano_base() -> Path:
+    """Return the folder of the pretrained nano model.
+
+    Flower's app bundle takes no weights, so a library that runs from a bundle looks where the package is installed.
+
+    Raises:
+        ValueError: it is in neither place.
+    """
+    places = [Path(__file__).parent, *_installed()]
+    for place in places:
+        if (place / "nano_base" / WEIGHTS_FILE).is_file():
+            return place / "nano_base"
+    raise ValueError(
+        f"base={NANO!r} is not here and the package fedvla-lib is not installed: install it on every machine of the "
+        "federation, or give another base"
+    )
+
+
+def _installed() -> list[Path]:
+    """Where the installed package's modules may be: in site-packages, or in the folder of an editable installation."""
+    try:
+        package = distribution(PACKAGE)
+    except PackageNotFoundError:
+        return []
+    source = json.loads(package.read_text("direct_url.json") or "{}").get("url", "")
+    places = [Path(str(package.locate_file("fedvla_lib")))]
+    return places + ([Path(url2pathname(urlsplit(source).path)) / "fedvla_lib"] if source.startswith("file:") else [])
+
+
 def base_digest(base: str) -> str:
     """Return a short hash of the weights that a base names, or its name where the weights are not a local file."""
-    file = (NANO_BASE if base == NANO else Path(base)) / WEIGHTS_FILE
+    file = (nano_base() if base == NANO else Path(base)) / WEIGHTS_FILE
     return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else base
 
 

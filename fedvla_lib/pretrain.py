@@ -56,7 +56,9 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
 
     Raises:
         FileExistsError: `out` is there already.
+        ValueError: a number of the recipe is not usable.
     """
+    _check(recipe)
     out = Path(out)
     if out.exists():
         raise FileExistsError(f"{out} exists already: give a folder that does not")
@@ -98,6 +100,13 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         write_json(made / CARD_FILE, account)
         os.replace(made, out)
     return out
+
+
+def _check(recipe: Recipe) -> None:
+    for name, value in asdict(recipe).items():
+        if value < 0 or (value == 0 and name not in ("jitter", "seed")):
+            flag = name.replace("_", "-")
+            raise ValueError(f"{flag}={value} is not usable: give a number above 0")
 
 
 def _name_backbone_here(folder: Path, backbone: str) -> None:
@@ -155,13 +164,13 @@ def _work_folder(recipe: Recipe) -> Path:
     return cache_dir() / f"pretraining-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
 
-def read_account(base: Path = model.NANO_BASE) -> dict[str, Any]:
-    """Return what was written about a base when it was made.
+def read_account(base: Path | None = None) -> dict[str, Any]:
+    """Return what was written about a base when it was made; default the one that comes with the package.
 
     Raises:
         ValueError: the folder holds no such account.
     """
-    path = Path(base) / CARD_FILE
+    path = (base or model.nano_base()) / CARD_FILE
     if not path.is_file():
         raise ValueError(f"{base} holds no {CARD_FILE}: it was not made by fedvla pretrain")
     return json.loads(path.read_text())

@@ -35,6 +35,7 @@ REPO_ID = "fedvla/so100_sim"  # a name LeRobot asks for; nothing is uploaded
 SETTINGS_FILE = "meta/recording.json"
 INFO_FILE = "meta/info.json"
 STAGING, LOCK = ".staging", ".lock"
+OLDER = {"num_labs": 1, "jitter": 0.0}  # recordings made before there were laboratories do not say so
 MAX_ATTEMPTS = 20  # seeds tried until the expert succeeds at an episode
 MAX_EPISODE_FRAMES = 1000  # frames an encoder may queue; LeRobot drops frames beyond that
 ONE_EPISODE_MB = 0.001  # a file is full when it holds one episode: closed files are what an interruption cannot hurt
@@ -141,7 +142,7 @@ def _check_folder(root: Path, settings: dict[str, Any]) -> None:
                 f"{root} is not a recording made by this command ({', '.join(foreign)}): give another folder"
             )
         return
-    found = json.loads((root / SETTINGS_FILE).read_text())
+    found = OLDER | json.loads((root / SETTINGS_FILE).read_text())
     for name, value in settings.items():
         if name != "episodes_per_task" and found.get(name) != value:
             raise ValueError(f"{root} was recorded with {name}={found.get(name)!r}, not {value!r}: give another folder")

@@ -16,7 +16,7 @@ from conftest import heed_interrupts
 from fedvla_lib.cli import build_parser, main, settings
 from fedvla_lib.config import Config, from_profile, from_run_config
 
-COMMANDS = ["doctor", "record", "experts", "config", "train", "run", "evaluate"]
+COMMANDS = ["doctor", "record", "pretrain", "experts", "config", "train", "run", "evaluate"]
 
 
 @pytest.mark.unit
@@ -53,6 +53,8 @@ def test_every_setting_is_a_flag_and_unset_flags_leave_the_profile_alone():
         (["record", "--episodes", "0"], "episodes-per-task=0 is not usable"),
         (["experts", "--episodes", "0"], "--episodes 0 is not usable: give 1 or more"),
         (["experts", "--task", "juggle"], "unknown task 'juggle'"),
+        (["pretrain", "--out", "{tmp}"], "{tmp} exists already: give a folder that does not"),
+        (["pretrain", "--out", "{tmp}/new", "--steps", "0"], "steps=0 is not usable: give a number above 0"),
         (["evaluate", "{tmp}"], "{tmp} is not a pretrained_model folder: it has no config.json"),
         (["evaluate", "{tmp}", "--rollouts", "0"], "--rollouts 0 is not usable"),
         (["train", "--resume", "{tmp}/none"], "{tmp}/none"),

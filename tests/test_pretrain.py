@@ -73,7 +73,7 @@ def test_a_base_can_be_moved_and_names_no_place_of_the_machine_that_made_it(made
 
 
 def test_the_base_in_the_package_is_small_whole_and_has_its_account():
-    size = sum(path.stat().st_size for path in model.NANO_BASE.rglob("*") if path.is_file())
+    size = sum(path.stat().st_size for path in model.nano_base().rglob("*") if path.is_file())
     assert size <= 10e6
     account = pretrain.read_account()
     assert account["recipe"] == json.loads(json.dumps(Recipe().__dict__))
@@ -102,3 +102,12 @@ def test_pretraining_draws_every_wording():
     for task in PRETRAINING_TASKS.values():
         texts = {draw_layout(task, rng, "red").instruction for _ in range(60)}
         assert len(texts) == len(task.wordings)
+
+
+def test_a_bundle_without_weights_finds_the_installed_package(tmp_path, monkeypatch):
+    """Flower's bundle takes .py files only, so the library in it lies beside no weights."""
+    monkeypatch.setattr(model, "__file__", str(tmp_path / "fedvla_lib" / "model.py"))
+    assert (model.nano_base() / model.WEIGHTS_FILE).is_file()
+    monkeypatch.setattr(model, "PACKAGE", "fedvla-lib-that-is-not-installed")
+    with pytest.raises(ValueError, match="install it on every machine"):
+        model.nano_base()
