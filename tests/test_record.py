@@ -47,10 +47,10 @@ def made_up_episode(index: int, length: int = 5) -> Episode:
 def write(root: Path, until: int) -> None:
     """Bring the made-up recording in `root` to `until` episodes."""
     done = recording_module._num_recorded(root)
-    recorder = recording_module._Recorder(root, SIZE, done)
+    recorder = recording_module._Recorder(root, {"image_size": SIZE, "num_labs": 1}, done)
     try:
         for index in range(done, until):
-            recorder.add(made_up_episode(index))
+            recorder.add(made_up_episode(index), lab=0)
     finally:
         recorder.close()
 
