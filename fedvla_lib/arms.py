@@ -13,6 +13,7 @@ from pathlib import Path
 from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
 from fedvla_lib.config import Config, cache_dir, code_digest
+from fedvla_lib.roster import draw_size
 from fedvla_lib.train import local_train
 
 # Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
@@ -22,14 +23,19 @@ TRAINED_BY = (
 )  # fmt: skip
 
 
-def steps_per_client(config: Config) -> int:
-    """Gradient steps that one client does in a federated run in which all clients train."""
-    return config.num_server_rounds * config.local_steps
-
-
 def total_steps(config: Config) -> int:
-    """Gradient steps that all clients together do: what the centralized arm may spend."""
-    return config.num_clients * steps_per_client(config)
+    """Gradient steps that all clients together do in a federated run: what the centralized arm may spend."""
+    return steps_in_a_row(config) * draw_size(config.fraction_train, config.num_clients)
+
+
+def steps_per_client(config: Config) -> int:
+    """Gradient steps that one client does in a federated run, on average where a round draws some of them."""
+    return max(1, total_steps(config) // config.num_clients)
+
+
+def steps_in_a_row(config: Config) -> int:
+    """Gradient steps between the start and the last global model of a federated run, one after the other."""
+    return config.num_server_rounds * config.local_steps
 
 
 def federated(config: Config, progress: bool = True) -> Path:

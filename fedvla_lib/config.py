@@ -27,8 +27,8 @@ class Config:
     num_clients: int = 10  # clients the episodes are partitioned over
     partition: str = "modulo"  # modulo, task, dirichlet or lab
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
-    num_server_rounds: int = 8  # rounds of federated averaging
-    fraction_train: float = 1.0  # share of clients that train in a round
+    num_server_rounds: int = 20  # rounds of federated averaging
+    fraction_train: float = 0.4  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
     # model
@@ -45,7 +45,7 @@ class Config:
     warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
     checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
     # evaluation
-    eval_every: int = 4  # rounds between closed-loop evaluations; 0 evaluates after the last round only
+    eval_every: int = 10  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 4  # rollouts per task of the global model at each evaluation
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
     action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
@@ -79,6 +79,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "image_size": 64,
         "num_clients": 3,
         "num_server_rounds": 2,
+        "fraction_train": 1.0,
         "local_steps": 2,
         "batch_size": 4,
         "warmup_steps": 1,
@@ -96,7 +97,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "chunk_size": 50,
         "n_action_steps": 50,
         "episodes_per_task": 100,
-        "num_server_rounds": 20,
+        "fraction_train": 1.0,
         "local_steps": 200,
         "batch_size": 64,
         "lr": 1e-4,

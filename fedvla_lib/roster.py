@@ -44,8 +44,13 @@ class Roster:
     def draw(self, share: float, rng: np.random.Generator) -> list[int]:
         """Draw a share of the clients without replacement (one at least, none if it is 0): node ids by partition."""
         nodes = sorted(self.partition_of, key=self.partition_of.get)
-        size = max(1, round(share * len(nodes))) if share else 0
+        size = draw_size(share, len(nodes))
         return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
+
+
+def draw_size(share: float, num_clients: int) -> int:
+    """Return how many clients a round draws: a share of them, one at least, none if the share is 0."""
+    return max(1, round(share * num_clients)) if share else 0
 
 
 def client_name(partition_id: int) -> str:
