@@ -25,6 +25,7 @@ from fedvla_lib.config import Config, check, to_run_config
 
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
 STATUS_TRIES, POLL_S = 6, 5.0
+FIRST_ERROR = re.compile(r"^Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
 OFFLINE = {  # Flower and Ray ask the network nothing
     "FLWR_TELEMETRY_ENABLED": "0",
     "FLWR_DISABLE_UPDATE_CHECK": "1",
@@ -59,12 +60,12 @@ class SuperLink:
             try:
                 process.wait(timeout_s)
             except subprocess.TimeoutExpired as error:
-                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {_tail(self.log)}") from error
+                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {_reason(self.log)}") from error
             finally:
                 process.kill()
         accepted = re.search(r"Successfully started run (\d+)", self.log.read_text(errors="replace"))
         if not accepted:
-            raise FlowerRunError(f"flwr run failed: {_tail(self.log)}")
+            raise FlowerRunError(f"flwr run failed: {_reason(self.log)}")
         return accepted[1]
 
     def status(self, run_id: str) -> tuple[str, str]:
@@ -156,16 +157,16 @@ def _require_completed(link: SuperLink, run_id: str) -> None:
             break
         time.sleep(POLL_S)
     if status != "finished:completed":
-        raise FlowerRunError(f"run {run_id} is {status} ({details}); its log ends: {_tail(link.log)}")
+        raise FlowerRunError(f"run {run_id} is {status} ({details}); {_reason(link.log)}")
 
 
 def _wait_until_up(process: subprocess.Popen, port: int, log: Path) -> None:
     deadline = time.monotonic() + STARTUP_S
     while not _answers(port):
         if process.poll() is not None:
-            raise FlowerRunError(f"the SuperLink ended with status {process.poll()}; its log ends: {_tail(log)}")
+            raise FlowerRunError(f"the SuperLink ended with status {process.poll()}; {_reason(log)}")
         if time.monotonic() > deadline:
-            raise FlowerRunError(f"the SuperLink did not answer within {STARTUP_S:.0f} s; its log ends: {_tail(log)}")
+            raise FlowerRunError(f"the SuperLink did not answer within {STARTUP_S:.0f} s; {_reason(log)}")
         time.sleep(0.5)
 
 
@@ -202,8 +203,12 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _tail(log: Path) -> str:
-    return _one_line(log.read_text(errors="replace"))
+def _reason(log: Path) -> str:
+    """The first exception of a log, which is the cause of those after it, and how the log ends."""
+    text = log.read_text(errors="replace")
+    found = FIRST_ERROR.search(text)
+    cause = f"it began with {_one_line(found[1])}; " if found else ""
+    return f"{cause}its log ends: {_one_line(text)}"
 
 
 def _one_line(text: str) -> str:
