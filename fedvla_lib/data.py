@@ -166,9 +166,9 @@ def frames(store: FrameStore, rows: Sequence[int] | np.ndarray, chunk_size: int)
 def _batch(store: FrameStore, rows: np.ndarray, chunk_size: int, rng: np.random.Generator | None) -> dict[str, Any]:
     pictures = {camera: images[rows] for camera, images in store.images.items()}  # uint8 (B, H, W, 3)
     if rng is None:
-        images = {camera: _to_float(picture) for camera, picture in pictures.items()}
+        images = {camera: to_float(picture) for camera, picture in pictures.items()}
     else:
-        images = _augment(pictures, rng)
+        images = augmented(pictures, rng)
     return {image_key(camera): image for camera, image in images.items()} | targets(store, rows, chunk_size)
 
 
@@ -184,14 +184,17 @@ def targets(store: FrameStore, rows: np.ndarray, chunk_size: int) -> dict[str, A
     }
 
 
-def _augment(pictures: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """Shift each camera's picture on its own, as if its mount were knocked; the light is common to all cameras."""
+def augmented(pictures: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """Return uint8 (B, H, W, 3) pictures of each camera as float32 (B, 3, H, W) in [0, 1], changed at random.
+
+    Each camera's picture is shifted on its own, as if its mount were knocked; the light is common to all cameras.
+    """
     batch_size = len(next(iter(pictures.values())))
     contrast = _column(rng.uniform(1 - CONTRAST, 1 + CONTRAST, batch_size))
     brightness = _column(rng.uniform(-BRIGHTNESS, BRIGHTNESS, batch_size))
     images = {}
     for camera, picture in pictures.items():
-        image = _to_float(_shift(picture, rng))  # (B, 3, H, W)
+        image = to_float(_shift(picture, rng))  # (B, 3, H, W)
         mean = image.mean(dim=(1, 2, 3), keepdim=True)
         images[camera] = image.mul_(contrast).add_(mean * (1 - contrast) + brightness).clamp_(0.0, 1.0)
     return images
@@ -207,7 +210,7 @@ def _shift(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack([image[top : top + height, left : left + width] for image, top, left in crops])
 
 
-def _to_float(picture: np.ndarray) -> torch.Tensor:
+def to_float(picture: np.ndarray) -> torch.Tensor:
     """uint8 (B, H, W, 3) -> float32 (B, 3, H, W) in [0, 1]."""
     channels_first = torch.from_numpy(picture).permute(0, 3, 1, 2).contiguous()
     return channels_first.to(torch.float32).div_(255.0)

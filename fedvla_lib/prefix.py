@@ -24,7 +24,7 @@ from transformers import DynamicCache
 from fedvla_lib.config import cache_dir
 from fedvla_lib.data import Batches, FrameStore, frames, targets
 from fedvla_lib.model import Bundle
-from fedvla_lib.spec import ACTION_KEY, STATE_KEY
+from fedvla_lib.spec import ACTION_KEY
 
 PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and which positions are real
 BATCH = 64  # frames per forward pass while filling the store
@@ -84,14 +84,6 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
     squared = ((noise - actions) - velocity).square()[..., : policy.config.action_feature.shape[0]]
     valid = ~inputs["action_is_pad"]
     return (squared * valid[..., None]).sum() / (valid.sum() * squared.shape[-1]).clamp_min(1)
-
-
-def repeated(batch: dict[str, Any], prefix: tuple[torch.Tensor, torch.Tensor], times: int) -> dict[str, Any]:
-    """Return the batch of `prefix`, each sample `times` times: several draws of noise for one look at the frame."""
-    rows = torch.arange(len(batch["task"])).repeat_interleave(times)
-    tensors = {key: batch[key][rows] for key in (STATE_KEY, ACTION_KEY, "action_is_pad")}
-    tasks = [batch["task"][row] for row in rows.tolist()]
-    return tensors | {"task": tasks, PREFIX_KEY: tuple(part[rows] for part in prefix)}
 
 
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:

@@ -1,7 +1,8 @@
-"""How the nano base is made: the nano model learns broad skills, and an account of it is written beside its weights.
+"""How the nano base is made: it learns to see, then to act, and an account of it is written beside its weights.
 
-SmolVLA's recipe is a vision-language model that knows the world and stays frozen while the action expert learns a task.
-The nano model knows nothing, so here all of it is trained, once, on tasks that no client will ever be asked for: reach,
+SmolVLA's recipe is a vision-language model that knows the world and stays frozen while the action expert learns. The
+nano model's vision-language part is made here: it learns what "the red cube" means and where on the table it is
+(`ground`). Then it is frozen, and the expert learns broad skills on tasks that no client will ever be asked for: reach,
 grip, drag, pull, nudge and point, with cubes of several colours, in a different light and from a slightly different
 angle in every episode. ``base = "nano"`` names the result, which comes with the package.
 """
@@ -17,38 +18,36 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from fedvla_lib import data, model
 from fedvla_lib.compare import success_table
 from fedvla_lib.config import Config, Recipe, cache_dir, code_digest
 from fedvla_lib.evaluate import evaluate, rollout_seeds
+from fedvla_lib.ground import Questions, grounding_loss, pointing_error_m, probing
+from fedvla_lib.prefix import stored
 from fedvla_lib.run_folder import first_stamp, write_json
+from fedvla_lib.scenery import draw_scenery
 from fedvla_lib.sim import So100Env
 from fedvla_lib.tasks import PRETRAINING_TASKS, TASKS
 from fedvla_lib.train import local_train
 
 CARD_FILE = "pretraining.json"
 TWO_CUBES = ("reach", "grip")  # tasks in which a second cube can stand on the table
-TRAINED_BY = (*data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train")
+TRAINED_BY = (*data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train", "scenery", "ground")
 
 
 def settings(recipe: Recipe) -> Config:
-    """Return the settings of a training of everything, from random weights."""
+    """Return the settings of the expert's training, in which the vision-language part is frozen."""
+    shared = ("episodes_per_task", "image_size", "batch_size", "lr", "checkpoint_every", "num_threads", "seed")
     return replace(
         Config(),
         base="nano-random",
         tasks=",".join(PRETRAINING_TASKS),
-        freeze_vision_encoder=False,
-        train_expert_only=False,
-        train_state_proj=True,
-        augment=True,
         warmup_steps=min(100, recipe.steps // 10),
-        **{name: getattr(recipe, name) for name in SHARED},
+        **{name: getattr(recipe, name) for name in shared},
     )
-
-
-SHARED = ("episodes_per_task", "image_size", "batch_size", "lr", "checkpoint_every", "num_threads", "seed")
 
 
 def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
@@ -75,10 +74,13 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     )
     store = data.open_store(recording, image_size=recipe.image_size)
     episodes = list(store.episodes.episode_id)
-    batches = data.Batches(store, episodes, config.chunk_size, recipe.batch_size, seed=recipe.seed, augment=True)
-    bundle = model.load_policy(config, data.episode_stats(store, episodes))
+    stats = data.episode_stats(store, episodes)
+    seeing, grounding = ground(recipe, stats, work, progress)
+    bundle = model.load_policy(config, stats)
+    bundle.policy.load_state_dict(seeing.policy.state_dict())
+    batches = data.Batches(store, episodes, config.chunk_size, recipe.batch_size, seed=recipe.seed)
     result = local_train(
-        bundle, batches, config, steps=recipe.steps, draws=recipe.draws,
+        bundle, stored(bundle, batches, progress), config, steps=recipe.steps,
         checkpoint_dir=work / "checkpoints", resume=True, progress=progress,
     )  # fmt: skip
     account = {
@@ -86,6 +88,7 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         "episodes": len(episodes),
         "frames": store.num_frames,
         "parameters": sum(p.numel() for p in bundle.policy.parameters()),
+        "grounding": grounding,
         "training_seconds": result.seconds,
         "last_loss": sum(result.losses[-100:]) / len(result.losses[-100:]),
         "success": measure(bundle, recipe, progress),
@@ -100,6 +103,30 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         write_json(made / CARD_FILE, account)
         os.replace(made, out)
     return out
+
+
+def ground(
+    recipe: Recipe, stats: data.Stats, work: Path, progress: bool = True
+) -> tuple[model.Bundle, dict[str, float]]:
+    """Teach a random nano model to see; return it with an account of how well it points at what a sentence names."""
+    everything = {"freeze_vision_encoder": False, "train_expert_only": False, "train_state_proj": True}
+    config = replace(settings(recipe), warmup_steps=min(100, recipe.grounding_steps // 10), **everything)
+    bundle = model.load_policy(config, stats)
+    drawing = {"image_size": recipe.image_size, "jitter": recipe.jitter, "progress": progress}
+    scenery = draw_scenery(work / "scenery", recipe.scenes, seed=recipe.seed, **drawing)
+    unseen = draw_scenery(work / "scenery_unseen", recipe.unseen_scenes, seed=recipe.seed + 1, **drawing)
+    with probing(bundle, recipe.seed):
+        result = local_train(
+            bundle, Questions(scenery, bundle, recipe.batch_size, recipe.seed), config, steps=recipe.grounding_steps,
+            checkpoint_dir=work / "grounding", resume=True, progress=progress, loss=grounding_loss,
+        )  # fmt: skip
+        missed_m = pointing_error_m(bundle, Questions(unseen, bundle, recipe.batch_size, recipe.seed))
+    return bundle, {
+        "seconds": result.seconds,
+        "phrase_tokens": len(missed_m),
+        "median_error_m": float(np.median(missed_m)),
+        "p90_error_m": float(np.quantile(missed_m, 0.9)),
+    }
 
 
 def _check(recipe: Recipe) -> None:

@@ -25,7 +25,7 @@ from gymnasium import spaces
 from fedvla_lib.lab import REFERENCE, Lab, draw_lab
 from fedvla_lib.scene import CUBES, GRASP_SITE, JOINTS, TIMESTEP_S, ZONES, arrange, build_scene, cubes_of, furnish
 from fedvla_lib.spec import CAMERAS, FPS, NUM_JOINTS, Observation
-from fedvla_lib.tasks import ALL_TASKS, CARRY_CLEARANCE_M, CUBE_HALF_M, Scene, check_tasks, draw_layout
+from fedvla_lib.tasks import ALL_TASKS, CARRY_CLEARANCE_M, CUBE_HALF_M, Patch, Scene, Task, check_tasks, draw_layout
 
 ENV_ID = "fedvla/So100-v0"
 ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # degrees that a joint shows when MuJoCo's angle is zero
@@ -44,7 +44,7 @@ class So100Env(gymnasium.Env):
     the episode; the task's horizon truncates it.
 
     Args:
-        task: a name from `tasks.ALL_TASKS`.
+        task: a name from `tasks.ALL_TASKS`, or a task of your own.
         image_size: side of the square camera images in pixels.
         render_mode: ``"rgb_array"`` or None; `render` returns all cameras side by side.
         cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time.
@@ -61,7 +61,7 @@ class So100Env(gymnasium.Env):
 
     def __init__(
         self,
-        task: str = "lift",
+        task: str | Task = "lift",
         image_size: int = 96,
         render_mode: str | None = "rgb_array",
         cameras: tuple[str, ...] = CAMERAS,
@@ -69,28 +69,33 @@ class So100Env(gymnasium.Env):
         jitter: float = 0.0,
         screen: "So100Env | None" = None,
     ) -> None:
-        check_tasks([task])
+        self._task = task if isinstance(task, Task) else ALL_TASKS[check_tasks([task])[0]]
         _check_view(image_size, render_mode, cameras)
-        self.task = task
+        self.task = self._task.name
         self.image_size = image_size
         self.render_mode = render_mode
         self.cameras = tuple(cameras)
         self.lab, self._jitter = lab, jitter
-        self._max_episode_steps = ALL_TASKS[task].horizon_steps
-        self.model = build_scene(ALL_TASKS[task], image_size)
+        self._max_episode_steps = self._task.horizon_steps
+        self.model = build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: _Renderer | None = None
         self._screen = screen or self
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
         self._parts = _parts(self.model)
-        self.layout = draw_layout(ALL_TASKS[task], np.random.default_rng(0))
+        self.layout = draw_layout(self._task, np.random.default_rng(0))
         self._needs_reset = True
 
     @property
     def instruction(self) -> str:
         """The request in words, for the cubes' colours in this episode."""
         return self.layout.instruction
+
+    @property
+    def zones(self) -> tuple[Patch, ...]:
+        """The coloured patches on the table, in the layout's order."""
+        return self._task.zones
 
     @property
     def task_description(self) -> str:
@@ -113,18 +118,23 @@ class So100Env(gymnasium.Env):
         return self.data.body(CUBES[0]).xpos.copy()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
-        """Start an episode. `options={"color": "red"}` fixes the cube's colour; the positions come from the seed.
+        """Start an episode.
+
+        Args:
+            seed: fixes where everything is.
+            options: ``"color"`` fixes the first cube's colour, ``"joints"`` where the arm starts, (6,), LeRobot units.
 
         Raises:
             ValueError: unknown colour.
         """
         super().reset(seed=seed)
+        options = options or {}
         if self._jitter:
             self.lab = draw_lab("drawn", self.np_random, self._jitter, offsets=False)
-        self.layout = draw_layout(ALL_TASKS[self.task], self.np_random, (options or {}).get("color"))
+        self.layout = draw_layout(self._task, self.np_random, options.get("color"))
         mujoco.mj_resetData(self.model, self.data)
         furnish(self.model, self.lab)
-        self._put_arm(HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS))
+        self._put_arm(options.get("joints", HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)))
         arrange(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
@@ -145,7 +155,7 @@ class So100Env(gymnasium.Env):
         low, high = self.action_space.low, self.action_space.high
         self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
         touched = self._advance()
-        task = ALL_TASKS[self.task]
+        task = self._task
         first, *others = (self._look(index, touched) for index in range(len(self._past)))
         self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
@@ -230,7 +240,7 @@ class So100Env(gymnasium.Env):
         return observation
 
     def _info(self) -> dict[str, Any]:
-        return {"is_success": self._streak >= ALL_TASKS[self.task].hold_steps}
+        return {"is_success": self._streak >= self._task.hold_steps}
 
     def _draw(self, camera: str) -> np.ndarray:
         screen = self._screen
@@ -304,6 +314,19 @@ def _close(reference: "weakref.ref[_Renderer]") -> None:
     renderer = reference()
     if renderer is not None:
         renderer.close()
+
+
+def project(model: mujoco.MjModel, data: mujoco.MjData, camera: str, points_m: np.ndarray) -> np.ndarray:
+    """Where points of the world frame, float64 (n, 3), appear in a camera's picture.
+
+    Returns:
+        float64 (n, 2): distance from the left and from the top edge, as shares of the side of the square picture;
+        outside [0, 1] for what the camera does not see. A pinhole: share = 1/2 + x / (2 z tan(fov / 2)).
+    """
+    view, angle_rad = data.camera(camera), np.deg2rad(model.camera(camera).fovy[0])
+    right, up, back = ((points_m - view.xpos) @ view.xmat.reshape(3, 3)).T  # the camera looks along minus its z axis
+    scale = 1 / (2 * np.tan(angle_rad / 2))
+    return np.column_stack([0.5 - scale * right / back, 0.5 + scale * up / back])
 
 
 def to_radians(joints: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:

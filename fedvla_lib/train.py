@@ -9,7 +9,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,11 +24,14 @@ from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, granted_threads
 from fedvla_lib.model import Bundle, predict_chunk
-from fedvla_lib.prefix import PREFIX_KEY, prefill, prefix_loss, repeated
+from fedvla_lib.prefix import PREFIX_KEY, prefix_loss
 from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES
 
 WEIGHTS_FILE = "trainable.safetensors"
 LOSSES_FILE = "losses.json"
+
+
+Loss = Callable[[Bundle, dict[str, Any]], torch.Tensor]  # of a policy on a raw batch
 
 
 class TrainingBatches(Protocol):
@@ -62,7 +65,7 @@ def local_train(
     checkpoint_dir: Path | None = None,
     resume: bool = False,
     progress: bool = True,
-    draws: int = 1,
+    loss: Loss | None = None,
 ) -> TrainResult:
     """Train the policy's trainable parameters in place for `steps` steps, from `start_step` of a schedule.
 
@@ -71,8 +74,7 @@ def local_train(
         total_steps: length of the schedule; default `start_step + steps`.
         checkpoint_dir: where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end.
         resume: continue from the newest checkpoint in `checkpoint_dir`; the result is bit for bit the same.
-        draws: noises and flow times drawn for each sample of a step. Only the expert runs for each of them, so that
-            more of them make the gradient of a trainable vision-language model less noisy for little time.
+        loss: what to minimise; default the policy's own flow-matching loss.
 
     Raises:
         FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
@@ -85,7 +87,7 @@ def local_train(
         bundle.policy.train()
         bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
         for step in bar:
-            losses.append(_step(bundle, batches.at(start_step + step), optimizer, scheduler, draws))
+            losses.append(_step(bundle, batches.at(start_step + step), optimizer, scheduler, loss or flow_loss))
             if not np.isfinite(losses[-1]):
                 raise FloatingPointError(f"loss is {losses[-1]} at step {start_step + step}: lower lr={config.lr}")
             bar.set_postfix(loss=f"{losses[-1]:.3f}")
@@ -137,22 +139,18 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.item()
 
 
-def _step(
-    bundle: Bundle, batch: dict[str, Any], optimizer: torch.optim.Optimizer, scheduler: Any, draws: int
-) -> float:
-    loss = _loss(bundle, batch, draws)
+def _step(bundle: Bundle, batch: dict[str, Any], optimizer: torch.optim.Optimizer, scheduler: Any, loss: Loss) -> float:
+    value = loss(bundle, batch)
     optimizer.zero_grad(set_to_none=True)
-    loss.backward()
+    value.backward()
     torch.nn.utils.clip_grad_norm_(_trainable(bundle), bundle.policy.config.optimizer_grad_clip_norm)
     optimizer.step()
     scheduler.step()
-    return loss.item()
+    return value.item()
 
 
-def _loss(bundle: Bundle, batch: dict[str, Any], draws: int) -> torch.Tensor:
-    """The policy's own loss, or the same from a prefix; noise and time are drawn alike in both."""
-    if draws > 1:
-        batch = repeated(batch, batch.get(PREFIX_KEY) or prefill(bundle, batch), draws)
+def flow_loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
+    """The policy's own loss, or the same from a stored prefix; noise and time are drawn alike in both."""
     if PREFIX_KEY not in batch:
         return bundle.policy.forward(bundle.preprocess(batch))[0]
     model, settings = bundle.policy.model, bundle.policy.config

@@ -18,8 +18,8 @@ APPS = {"client_app", "server_app"}
 FENCES = {
     "mujoco": {"sim", "scene", "expert"},
     "mink": {"expert"},
-    "torch": {"model", "params", "train", "prefix", "data"},
-    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env"},
+    "torch": {"model", "params", "train", "prefix", "data", "ground"},
+    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env", "ground"},
     "flwr": {"wire", "roster", "strategies", "engine"} | APPS,
     "flwr_datasets": {"partition"},
     "matplotlib": {"plots"},

@@ -14,7 +14,10 @@ from fedvla_lib.sim import So100Env
 from fedvla_lib.tasks import PRETRAINING_TASKS, TASKS, draw_layout
 
 pytestmark = pytest.mark.integration
-SMALL = Recipe(steps=4, episodes_per_task=1, image_size=64, batch_size=4, draws=2, rollouts=1, checkpoint_every=2)
+SMALL = Recipe(
+    scenes=8, unseen_scenes=4, grounding_steps=2, steps=4, episodes_per_task=1, image_size=64, batch_size=4, rollouts=1,
+    checkpoint_every=2,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
