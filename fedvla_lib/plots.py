@@ -16,6 +16,7 @@ from fedvla_lib.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
 ARM_COLORS = {"base": "#7F7F7F", "local-only": "#E69F00", "federated": "#0072B2", "centralized": "#009E73"}
+WIDTH = 7  # inches; on a page a wider figure shrinks, and its text with it
 STYLE = {
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
@@ -39,15 +40,14 @@ def use_style() -> None:
 def joints(states: np.ndarray, actions: np.ndarray, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw measured state and commanded action, both (T, 6), against time: one panel per joint."""
     if axes is None:
-        _, grid = plt.subplots(2, 3, figsize=(10, 4.6), sharex=True, layout="constrained")
-        axes = grid.ravel()
+        axes = _joint_axes()
     seconds = np.arange(len(states)) / FPS
     for i, ax in enumerate(axes):
         ax.plot(seconds, states[:, i], label="state")
         ax.plot(seconds, actions[:, i], "--", label="action")
         ax.set_title(JOINT_NAMES[i], fontsize=10)
         ax.set_ylabel(f"position [{JOINT_UNITS[i]}]")
-    for ax in axes[-3:]:
+    for ax in axes[-2:]:
         ax.set_xlabel("time [s]")
     axes[0].legend(frameon=False)
     return axes
@@ -57,8 +57,8 @@ def film_strip(frames: np.ndarray, *, count: int = 6, title: str = "", ax: Axes 
     """Draw `count` frames of a video (T, H, W, 3), evenly spaced from first to last, side by side."""
     picks = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
     if ax is None:
-        height = 10 / len(picks) * frames.shape[1] / frames.shape[2] + 0.5
-        _, ax = plt.subplots(figsize=(10, height), layout="constrained")
+        height = WIDTH / len(picks) * frames.shape[1] / frames.shape[2] + 0.6
+        _, ax = plt.subplots(figsize=(WIDTH, height), layout="constrained")
     gap = max(1, frames.shape[2] // 32)  # white, so that one frame does not run into the next
     spaced = np.pad(frames[picks], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
     ax.imshow(np.concatenate(list(spaced), axis=1)[:, :-gap])
@@ -78,6 +78,7 @@ def client_counts(counts: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     for i, task in enumerate(counts.columns):
         ax.bar(counts.index.astype(str), counts[task], bottom=bottom, label=task, color=PALETTE[i % len(PALETTE)])
         bottom += counts[task].to_numpy()
+    ax.set_ylim(0, max(1.08 * bottom.max(), ax.get_ylim()[1]))  # the other panels of a shared scale count too
     ax.set_xlabel("client")
     ax.set_ylabel("episodes")
     ax.legend(frameon=False, title="task")
@@ -104,7 +105,7 @@ def by_round(table: pd.DataFrame, value: str, *, ylabel: str, label: str = "", a
     (line,) = ax.plot(table["round"], table[value], "o-", label=label or value)
     if {"low", "high"} <= set(table.columns):
         ax.fill_between(table["round"], table.low, table.high, color=line.get_color(), alpha=0.15)
-    ax.set_xticks(sorted(set(table["round"])))
+    _round_ticks(ax, table["round"])
     ax.set_xlabel("round")
     ax.set_ylabel(ylabel)
     ax.legend(frameon=False)
@@ -131,14 +132,29 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def _new_axes() -> Axes:
-    _, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    _, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
     return ax
+
+
+def _round_ticks(ax: Axes, rounds: pd.Series) -> None:
+    """A tick for each round, or for some of them where the labels of all would touch."""
+    numbers = sorted(set(rounds))
+    if len(numbers) <= 8:
+        ax.set_xticks(numbers)
+    else:
+        ax.xaxis.set_major_locator(plt.MaxNLocator(6, integer=True))
+
+
+def _joint_axes() -> Sequence[Axes]:
+    """A panel per joint, two side by side: three would be too small on a page."""
+    _, grid = plt.subplots(3, 2, figsize=(WIDTH, 6.2), sharex=True, layout="constrained")
+    return grid.ravel()
 
 
 def module_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw parameters per part of a model, trainable and frozen; columns part, parameters, trainable."""
     if ax is None:
-        _, ax = plt.subplots(figsize=(8, 0.38 * len(table) + 1.1), layout="constrained")
+        _, ax = plt.subplots(figsize=(WIDTH, 0.38 * len(table) + 1.1), layout="constrained")
     millions, trainable = table.parameters / 1e6, table.trainable / 1e6
     ax.barh(table.part, trainable, color=PALETTE[0], label="trainable")
     ax.barh(table.part, millions - trainable, left=trainable, color="#BBBBBB", label="frozen")
@@ -155,7 +171,7 @@ def module_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 def trainable_bars(tables: dict[str, pd.DataFrame], *, ax: Axes | None = None) -> Axes:
     """Draw how many parameters train under each setting, split into parts (columns as `module_bars`)."""
     if ax is None:
-        _, ax = plt.subplots(figsize=(8, 0.5 * len(tables) + 1.9), layout="constrained")
+        _, ax = plt.subplots(figsize=(WIDTH, 0.5 * len(tables) + 1.9), layout="constrained")
     counts = pd.DataFrame({name: table.set_index("part").trainable for name, table in tables.items()}) / 1e6
     left = np.zeros(len(tables))
     for i, part in enumerate(counts.index[counts.sum(axis=1) > 0]):
@@ -194,7 +210,7 @@ def padding(masks: np.ndarray, *, ax: Axes | None = None) -> Axes:
     ax.grid(False)
     ax.set_xlabel("step of the chunk")
     ax.set_ylabel("frames before the end of the episode")
-    ax.set_yticks(np.arange(len(masks)) + 0.5, np.arange(len(masks), 0, -1), fontsize=7)
+    ax.set_yticks(np.arange(len(masks)) + 0.5, np.arange(len(masks), 0, -1), fontsize=8)
     ax.legend(frameon=False, ncols=2, loc="upper center", bbox_to_anchor=(0.5, 1.15))
     return ax
 
@@ -293,14 +309,13 @@ def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw measured joint positions (T, 6) of several actors against time: one panel per joint."""
     if axes is None:
-        _, grid = plt.subplots(2, 3, figsize=(10, 4.6), sharex=True, layout="constrained")
-        axes = grid.ravel()
+        axes = _joint_axes()
     for i, ax in enumerate(axes):
         for name, states in by_name.items():
             ax.plot(np.arange(len(states)) / FPS, states[:, i], label=name)
         ax.set_title(JOINT_NAMES[i], fontsize=10)
         ax.set_ylabel(f"position [{JOINT_UNITS[i]}]")
-    for ax in axes[-3:]:
+    for ax in axes[-2:]:
         ax.set_xlabel("time [s]")
     axes[0].legend(frameon=False, fontsize=8)
     return axes
@@ -309,7 +324,7 @@ def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None 
 def film_strips(images: dict[str, np.ndarray], *, count: int = 6, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw each camera's film strip, camera -> (T, H, W, 3), one under the other."""
     if axes is None:
-        _, grid = plt.subplots(len(images), 1, figsize=(10, 2.1 * len(images)), layout="constrained", squeeze=False)
+        _, grid = plt.subplots(len(images), 1, figsize=(WIDTH, 1.7 * len(images)), layout="constrained", squeeze=False)
         axes = grid.ravel()
     for ax, (camera, frames) in zip(axes, images.items(), strict=True):
         film_strip(frames, count=count, title=f"camera: {camera}", ax=ax)
@@ -322,7 +337,7 @@ def pictures(rows: dict[str, np.ndarray], *, titles: Sequence[str] = (), axes: n
     """Draw a table of pictures: each entry of `rows` is one row of them, (n, H, W, 3); `titles` name the columns."""
     count = len(next(iter(rows.values())))
     if axes is None:
-        side = min(10 / count, 2.2)
+        side = min(WIDTH / count, 2.2)
         size = (side * count, side * len(rows) + 0.4)
         _, axes = plt.subplots(len(rows), count, figsize=size, layout="constrained", squeeze=False)
     for line, (name, frames) in zip(axes, rows.items(), strict=True):
@@ -367,7 +382,7 @@ def likeness(gaps_s: np.ndarray, distances: np.ndarray, elsewhere: float, *, ax:
 def client_counts_grid(counts: dict[str, pd.DataFrame], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw `client_counts` of several partitions side by side, on one scale; the keys become titles."""
     if axes is None:
-        _, axes = plt.subplots(1, len(counts), figsize=(10, 3.4), sharey=True, layout="constrained")
+        _, axes = plt.subplots(1, len(counts), figsize=(WIDTH, 3.2), sharey=True, layout="constrained")
     for ax, (name, table) in zip(axes, counts.items(), strict=True):
         client_counts(table, ax=ax)
         ax.set_title(name, fontsize=10)
@@ -406,8 +421,7 @@ def client_statistics(
 ) -> Sequence[Axes]:
     """Draw each client's mean and standard deviation per joint, both (clients, 6), over the pooled ones, (6,)."""
     if axes is None:
-        _, grid = plt.subplots(2, 3, figsize=(10, 4.8), sharex=True, layout="constrained")
-        axes = grid.ravel()
+        axes = _joint_axes()
     places = np.arange(len(means))
     for i, ax in enumerate(axes):
         low, high = pooled_mean[i] - pooled_std[i], pooled_mean[i] + pooled_std[i]
@@ -417,7 +431,7 @@ def client_statistics(
         ax.set_title(JOINT_NAMES[i], fontsize=10)
         ax.set_ylabel(f"action [{JOINT_UNITS[i]}]")
         ax.set_xticks(places)
-    for ax in axes[-3:]:
+    for ax in axes[-2:]:
         ax.set_xlabel("client")
     _legend_above(axes)
     return axes
@@ -466,7 +480,7 @@ def clients_by_round(table: pd.DataFrame, value: str, *, ylabel: str, ax: Axes |
     weighted = (table[value] * table.num_examples).groupby(table["round"]).sum()
     mean = weighted / table.groupby("round").num_examples.sum()
     ax.plot(mean.index, mean, "o-", color=PALETTE[0], linewidth=2, label="mean weighted by frames")
-    ax.set_xticks(sorted(set(table["round"])))
+    _round_ticks(ax, table["round"])
     ax.set_xlabel("round")
     ax.set_ylabel(ylabel)
     ax.legend(frameon=False)
@@ -479,7 +493,7 @@ def cosine_map(cosines: np.ndarray, *, title: str = "", ax: Axes | None = None) 
     picture = ax.imshow(cosines, cmap="RdBu", vmin=-1, vmax=1)
     for (i, j), cosine in np.ndenumerate(cosines):
         shade = "white" if abs(cosine) > 0.6 else "black"
-        ax.text(j, i, f"{cosine:.2f}", ha="center", va="center", fontsize=7, color=shade)
+        ax.text(j, i, f"{cosine:.2f}", ha="center", va="center", fontsize=8, color=shade)
     ax.set_xticks(range(len(cosines)))
     ax.set_yticks(range(len(cosines)))
     ax.grid(False)
@@ -497,9 +511,13 @@ def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
         color = ARM_COLORS.get(point.arm, PALETTE[i % len(PALETTE)])
         error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
         ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.arm)
-    ax.set_xlim(0, 1.1 * table.loss.max())
+    ax.set_xscale("log")  # the start may lie many times above the trained arms
+    ax.set_xlim(table.loss.min() / 1.4, 1.4 * table.loss.max())
+    ax.xaxis.set_major_locator(plt.LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    ax.xaxis.set_major_formatter(lambda loss, _: f"{loss:g}")
+    ax.xaxis.set_minor_locator(plt.NullLocator())
     ax.set_ylim(-0.02, 1.02)
-    ax.set_xlabel("held-out loss [normalised units²]")
+    ax.set_xlabel("held-out loss [normalised units², logarithmic]")
     ax.set_ylabel("success rate (95 % Wilson interval)")
     ax.legend(frameon=False)
     return ax
