@@ -31,6 +31,7 @@ PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", "
 RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
+TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
 SPEED = "book/speed.md"  # the page that ends with the results of the benchmarks
 BENCHMARKS = "benchmarks/results"
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
@@ -245,28 +246,34 @@ def _times_table(chapters: list[Chapter], profile: str) -> str:
 def _card_tables(account: dict) -> str:
     """What was measured of the nano base, as the end of its page."""
     recipe, stamp = account["recipe"], account["stamp"]
+    seen = account["grounding"]
+    batch, cores = recipe["batch_size"], "one core" if recipe["num_threads"] == 1 else f"{recipe['num_threads']} cores"
     facts = {
         "parameters": f"{account['parameters']:,}",
-        "episodes": f"{account['episodes']:,}",
-        "frames": f"{account['frames']:,}",
-        "optimiser steps": f"{recipe['steps']:,} of {recipe['batch_size']} samples, {recipe['draws']} noises each",
-        "training time": f"{account['training_seconds'] / 60:.0f} minutes on {recipe['num_threads']} core(s)",
+        "scenes for learning to see": f"{recipe['scenes']:,}",
+        "steps of the vision-language part": f"{recipe['grounding_steps']:,} of {batch} scenes",
+        "their time": f"{seen['seconds'] / 60:.0f} minutes on {cores}",
+        "pointing, median error": f"{1000 * seen['median_error_m']:.0f} mm",
+        "pointing, 90 % within": f"{1000 * seen['p90_error_m']:.0f} mm",
+        "demonstrations": f"{account['episodes']:,} ({account['frames']:,} frames)",
+        "steps of the action expert": f"{recipe['steps']:,} of {batch} samples",
+        "their time ": f"{account['training_seconds'] / 60:.0f} minutes on {cores}",
         "mean loss of the last 100 steps": f"{account['last_loss']:.3f}",
         "seed": str(recipe["seed"]),
         "made": f"{stamp['started'][:10]}, torch {stamp['versions']['torch']}, lerobot {stamp['versions']['lerobot']}",
     }
-    made = _table(["", ""], [[name, value] for name, value in facts.items()])
+    made = _table(["what", "measured"], [[name, value] for name, value in facts.items()])
     success = _table(["task", "successes", "rate", "95 % interval"], [_rate(row, "task") for row in account["success"]])
     told = _table(
         ["task", "told", "successes", "rate", "95 % interval"],
-        [[row["task"], f"the {row['told']} cube", *_rate(row, "task")[1:]] for row in account["language"]],
+        [[row["task"], TOLD[row["told"]], *_rate(row, "task")[1:]] for row in account["language"]],
     )
     return (
         f"## The account\n\n{made}\n## Success\n\nIn the reference laboratory, on seeds that no demonstration has. "
         "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, never seen, "
         f"so this is what the base can do before any lab has trained.\n\n{success}\n## Does the sentence decide?\n\n"
-        "Two cubes on the table. Success is counted for one of them while the arm is told that one (right) or the "
-        f"other.\n\n{told}"
+        "Two cubes of different colours stand on the table. Success is counted for one of them, while the arm is told "
+        f"its colour or the other one's.\n\n{told}"
     )
 
 

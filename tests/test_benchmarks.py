@@ -35,6 +35,17 @@ def test_a_ratio_is_reported(name, tmp_path):
     assert row["ratio"] > 0
 
 
+def test_the_floor_is_below_what_is_measured(tmp_path):
+    kept, whole = run("floor", tmp_path)
+    assert 0 < kept["operations [G]"] < whole["operations [G]"]
+    assert kept["times the floor"] > 1 and whole["times the floor"] > 1
+
+
+def test_ours_is_measured_without_the_peers(tmp_path):
+    (row,) = run("peers", tmp_path, "--peers")
+    assert row["simulator"] == "this library" and row["ours is faster by"] == 1
+
+
 def test_a_federation_is_measured_against_its_clients(tmp_path):
     (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0

@@ -1,0 +1,65 @@
+"""How far a training step is from what this machine's arithmetic allows.
+
+The floor is the step's floating-point operations over the rate at which the machine multiplies matrices of that kind of
+size; nothing that computes the same step in float32 on these cores can be faster.
+
+    python benchmarks/floor.py
+"""
+
+import torch
+from report import laptop, median_seconds, options, recording, report
+from torch.utils.flop_counter import FlopCounterMode
+
+from fedvla_lib import data, model, prefix
+from fedvla_lib.train import flow_loss, local_train
+
+STEPS = 10  # of each measurement of a training
+SIDE = 512  # of the matrices multiplied to find the machine's rate: they fit into a core's own cache
+
+
+def main() -> None:
+    """Measure and report."""
+    chosen = options(__doc__.splitlines()[0]).parse_args()
+    config = laptop(chosen.profile)
+    torch.set_num_threads(1)
+    store = recording(config)
+    episodes = list(store.episodes.episode_id)
+    batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
+    bundle = model.load_policy(config, data.episode_stats(store, episodes))
+    kept = prefix.stored(bundle, batches)
+    rate = operations_per_second(chosen.repeats)
+    rows = []
+    for name, supply in {"stored prefix": kept, "whole model, frozen prefix": batches}.items():
+        with FlopCounterMode(display=False) as counter:
+            flow_loss(bundle, supply.at(0)).backward()
+        step_s = median_seconds(
+            lambda supply=supply: local_train(bundle, supply, config, steps=STEPS, progress=False), chosen.repeats
+        ) / STEPS
+        floor_s = counter.get_total_flops() / rate
+        rows.append(
+            {
+                "step": name,
+                "operations [G]": counter.get_total_flops() / 1e9,
+                "machine [G/s]": rate / 1e9,
+                "floor [ms]": 1000 * floor_s,
+                "measured [ms]": 1000 * step_s,
+                "times the floor": step_s / floor_s,
+            }
+        )
+    report("floor", rows, chosen.out)
+
+
+def operations_per_second(repeats: int) -> float:
+    """Return the rate of float32 matrix multiplication on one core, two operations a multiply-add."""
+    left, right = torch.randn(SIDE, SIDE), torch.randn(SIDE, SIDE)
+    count = 20
+
+    def multiply() -> None:
+        for _ in range(count):
+            left @ right
+
+    return count * 2 * SIDE**3 / median_seconds(multiply, repeats)
+
+
+if __name__ == "__main__":
+    main()
