@@ -41,7 +41,7 @@ PLUGIN = """
 import gymnasium, lerobot_env_so101
 env = gymnasium.make("lerobot_env_so101/SO101PickCube-v0", image_obs=True, render_mode="rgb_array")
 """
-PEERS = {  # requirement -> (what makes its environment, cameras, pixels or None where we choose, control steps a second)
+PEERS = {  # requirement -> (what makes its environment, cameras, pixels or None if we choose, control steps a second)
     "so101-nexus==0.10.0": (NEXUS, 2, None, 50),
     "lerobot-env-so101==0.4.0": (PLUGIN, 1, 128, 10),
 }
