@@ -1,7 +1,8 @@
 """Run the Flower app on Flower's simulation runtime: a local SuperLink, `flwr run`, and the run's real status.
 
-These are the documented commands, wrapped because three of their defaults trip a small machine: the SuperLink that
-`flwr run` starts by itself gives up after 15 s, a client asks for two cores, and a failed run still exits with 0.
+These are the documented commands, wrapped because four of their habits trip a small machine: the SuperLink that
+`flwr run` starts by itself gives up after 15 s, a client asks for two cores, a failed run still exits with 0, and Ray,
+which runs the clients, allows a helper process of its own 15 s to start.
 """
 
 import json
@@ -25,7 +26,9 @@ from fedvla_lib.config import Config, check, to_run_config
 
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
 STATUS_TRIES, POLL_S = 6, 5.0
-FIRST_ERROR = re.compile(r"^Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
+RUNTIME_TRIES = 3  # Ray's 15 s are fixed in its code; a busy machine misses them, seldom twice
+NOT_STARTED = "Simulation Runtime crashed"  # what Flower says if Ray did not come up, before any client was asked
+FIRST_ERROR = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
 OFFLINE = {  # Flower and Ray ask the network nothing
     "FLWR_TELEMETRY_ENABLED": "0",
     "FLWR_DISABLE_UPDATE_CHECK": "1",
@@ -97,8 +100,17 @@ def run_simulation(
         with local_superlink(Path(folder)) as link:
             federation = f"num-supernodes={config.num_clients} {resources}"
             options = ["--federation-config", federation, "--run-config", str(settings)]
-            _require_completed(link, link.submit(app, *options, timeout_s=timeout_s))
+            _require_completed(link, _submit(link, app, options, timeout_s))
     return max(set(out.glob("*")) - before)
+
+
+def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) -> str:
+    """Run the app, again if Flower's runtime did not come up, and return the id of the last run."""
+    for _ in range(RUNTIME_TRIES):
+        run_id = link.submit(app, *options, timeout_s=timeout_s)
+        if NOT_STARTED not in link.log.read_text(errors="replace"):
+            break
+    return run_id
 
 
 @contextmanager
