@@ -32,6 +32,8 @@ RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
 TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
+WORTH = "fine_tuning.json"  # of the benchmarks, the one about the nano base
+TITLES = {"fine_tuning": "what it is worth: each task learned alone from the base, on one core", "floor": "the floor"}
 SPEED = "book/speed.md"  # the page that ends with the results of the benchmarks
 BENCHMARKS = "benchmarks/results"
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
@@ -210,8 +212,10 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
+        wanted[Path(MODEL_CARD)] += _benchmark_tables([root / BENCHMARKS / WORTH]).encode()
     if Path(SPEED) in wanted:
-        wanted[Path(SPEED)] += _benchmark_tables(root / BENCHMARKS).encode()
+        speeds = [path for path in sorted((root / BENCHMARKS).glob("*.json")) if path.name != WORTH]
+        wanted[Path(SPEED)] += _benchmark_tables(speeds).encode()
     for path, content in wanted.items():
         _write_if_changed(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
@@ -273,17 +277,17 @@ def _card_tables(account: dict) -> str:
         "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, never seen, "
         f"so this is what the base can do before any lab has trained.\n\n{success}\n## Does the sentence decide?\n\n"
         "Two cubes of different colours stand on the table. Success is counted for one of them, while the arm is told "
-        f"its colour or the other one's.\n\n{told}"
+        f"its colour or the other one's.\n\n{told}\n"
     )
 
 
-def _benchmark_tables(folder: Path) -> str:
-    """The results of the benchmarks that were kept, one section each."""
+def _benchmark_tables(files: list[Path]) -> str:
+    """The results of benchmarks that were kept, one section each."""
     parts = []
-    for path in sorted(folder.glob("*.json")):
+    for path in filter(Path.is_file, files):
         result = json.loads(path.read_text(encoding="utf-8"))
         rows = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in result["rows"]]
-        title = path.stem.replace("_", " ")
+        title = TITLES.get(path.stem, path.stem.replace("_", " "))
         where = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
         parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{_table(list(result['rows'][0]), rows)}")
     return "\n".join(parts)

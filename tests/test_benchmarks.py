@@ -46,6 +46,11 @@ def test_ours_is_measured_without_the_peers(tmp_path):
     assert row["simulator"] == "this library" and row["ours is faster by"] == 1
 
 
+def test_the_base_is_trained_and_acts(tmp_path):
+    (row,) = run("fine_tuning", tmp_path, "--tasks", "lift", "--demonstrations", "2", "--steps", "2", "--rollouts", "1")
+    assert row["demonstrations"] == 2 and row["rollouts"] == 1 and row["training [s]"] > 0
+
+
 def test_a_federation_is_measured_against_its_clients(tmp_path):
     (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0
