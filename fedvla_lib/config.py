@@ -27,7 +27,7 @@ class Config:
     num_clients: int = 10  # clients the episodes are partitioned over
     partition: str = "modulo"  # modulo, task, dirichlet or lab
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
-    num_server_rounds: int = 20  # rounds of federated averaging
+    num_server_rounds: int = 10  # rounds of federated averaging
     fraction_train: float = 0.4  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
@@ -45,7 +45,7 @@ class Config:
     warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
     checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
     # evaluation
-    eval_every: int = 10  # rounds between closed-loop evaluations; 0 evaluates after the last round only
+    eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 4  # rollouts per task of the global model at each evaluation
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
     action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
