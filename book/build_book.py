@@ -32,9 +32,19 @@ RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
 TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
-WORTH = "fine_tuning.json"  # of the benchmarks, the one about the nano base
-TITLES = {"fine_tuning": "what it is worth: each task learned alone from the base, on one core", "floor": "the floor"}
-SPEED = "book/speed.md"  # the page that ends with the results of the benchmarks
+# Pages that end with results of benchmarks that were kept.
+RESULTS_ON = {
+    MODEL_CARD: ["fine_tuning"],
+    "book/reference_runs.md": ["four_arms"],
+    "book/speed.md": [
+        "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
+    ],
+}  # fmt: skip
+TITLES = {
+    "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
+    "four_arms": "who wins: federated, centralized, and every client alone",
+    "floor": "the floor",
+}
 BENCHMARKS = "benchmarks/results"
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
@@ -212,10 +222,9 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
-        wanted[Path(MODEL_CARD)] += _benchmark_tables([root / BENCHMARKS / WORTH]).encode()
-    if Path(SPEED) in wanted:
-        speeds = [path for path in sorted((root / BENCHMARKS).glob("*.json")) if path.name != WORTH]
-        wanted[Path(SPEED)] += _benchmark_tables(speeds).encode()
+    for page, names in RESULTS_ON.items():
+        if Path(page) in wanted:
+            wanted[Path(page)] += _benchmark_tables([root / BENCHMARKS / f"{name}.json" for name in names]).encode()
     for path, content in wanted.items():
         _write_if_changed(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:

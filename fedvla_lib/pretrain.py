@@ -63,6 +63,7 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         raise FileExistsError(f"{out} exists already: give a folder that does not")
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     began, config, work = time.perf_counter(), settings(recipe), _work_folder(recipe)
+    stamp = first_stamp(config, "pretrain")
     recording = data.record(
         list(PRETRAINING_TASKS),
         recipe.episodes_per_task,
@@ -93,9 +94,9 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         "last_loss": sum(result.losses[-100:]) / len(result.losses[-100:]),
         "success": measure(bundle, recipe, progress),
         "language": obeys(bundle, recipe, progress),
-        "stamp": first_stamp(config, "pretrain"),
     }
-    account["seconds"] = time.perf_counter() - began
+    seconds = time.perf_counter() - began
+    account |= {"stamp": stamp | {"status": "completed", "wall_s": seconds}}
     with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".pretraining-") as scratch:
         made = Path(scratch) / out.name
         model.save_policy(bundle, made)

@@ -51,6 +51,17 @@ def test_the_base_is_trained_and_acts(tmp_path):
     assert row["demonstrations"] == 2 and row["rollouts"] == 1 and row["training [s]"] > 0
 
 
+def test_every_client_is_compared_with_the_federation(tmp_path):
+    arguments = ["--seeds", "0", "--rollouts", "1"]
+    found = {row["arm"]: row for row in run("four_arms", tmp_path, *arguments)}
+    tasks, clients = 3, from_profile("tiny").num_clients
+    assert found["federated"]["attempts"] == tasks and found["all clients alone"]["attempts"] == tasks * clients
+    (kept,) = (tmp_path / "four_arms").glob("*.json")
+    before = kept.stat().st_mtime_ns
+    assert {row["arm"]: row for row in run("four_arms", tmp_path, *arguments)} == found
+    assert kept.stat().st_mtime_ns == before  # not measured again
+
+
 def test_a_federation_is_measured_against_its_clients(tmp_path):
     (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0

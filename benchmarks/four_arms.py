@@ -1,0 +1,106 @@
+"""Federated, centralized and every client alone, on the same attempts, over several seeds.
+
+A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are the same ones. The best client
+of a run is chosen by these very attempts, which favours it. Finished seeds are kept and not measured again.
+
+    python benchmarks/four_arms.py
+"""
+
+import json
+from argparse import Namespace
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pandas as pd
+from report import cores, laptop, options, report
+
+from fedvla_lib import arms, data
+from fedvla_lib.compare import paired_difference, success_table
+from fedvla_lib.config import Config, task_names
+from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
+from fedvla_lib.model import Bundle, PolicyActor
+from fedvla_lib.run_folder import write_json
+
+STARTS_FROM = FIRST_SEED + 1000  # apart from the starting positions of the chapters
+BEST = "best client alone"
+
+
+def main() -> None:
+    """Measure and report."""
+    parser = options(__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the runs")
+    parser.add_argument("--rollouts", type=int, default=20, help="attempts at each task, for each model and seed")
+    chosen = parser.parse_args()
+    recording = data.resolve(laptop(chosen.profile))
+    config = laptop(chosen.profile, num_threads=cores(), data=str(recording))
+    rows = pd.concat([one_seed(config, seed, chosen) for seed in chosen.seeds], ignore_index=True)
+    report("four_arms", summary(rows), chosen.out)
+
+
+def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
+    """Return a row for each attempt of each model of a run."""
+    config = replace(config, seed=seed)
+    run = arms.federated(config)
+    kept = chosen.out / "four_arms" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
+    if not kept.is_file():
+        starts = rollout_seeds(chosen.rollouts, first=STARTS_FROM)
+        rows = [row for name, bundle in models(config) for row in attempts(name, bundle, config, starts)]
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_json(kept, rows)
+    return pd.DataFrame(json.loads(kept.read_text())).assign(run=seed)
+
+
+def attempts(name: str, bundle: Bundle, config: Config, starts: list[int]) -> list[dict[str, object]]:
+    """Return what a table of pairs needs of each attempt of a model."""
+    found = evaluate(PolicyActor(bundle, config.seed), task_names(config), starts, image_size=config.image_size)
+    return [{"arm": name, "task": row["task"], "seed": row["seed"], "success": row["success"]} for row in found]
+
+
+def models(config: Config) -> Iterator[tuple[str, Bundle]]:
+    """Yield every model that is compared, with its name."""
+    yield "federated", arms.federated_policy(config)
+    yield "centralized", arms.centralized(config)
+    for client in range(config.num_clients):
+        yield f"client_{client} alone", arms.local_only(config, client)
+
+
+def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
+    """Return a line for each arm: successes with interval, and how far federated is ahead on the same attempts."""
+    alone = rows[rows.arm.str.endswith(" alone")]
+    best = pd.concat([part[part.arm == part.groupby("arm").success.sum().idxmax()] for _, part in alone.groupby("run")])
+    counted = {"federated": rows[rows.arm == "federated"], "centralized": rows[rows.arm == "centralized"]}
+    counted |= {BEST: best, "all clients alone": alone}
+    found = []
+    for name, part in counted.items():
+        (line,) = success_table(part.assign(arm=name), ["arm"]).to_dict("records")
+        ahead = ahead_of(name, counted) if name in ("centralized", BEST) else {}
+        found.append(
+            {
+                "arm": name,
+                "runs": int(part.run.nunique()),
+                "attempts": int(line["n"]),
+                "successes": int(line["successes"]),
+                "95 % interval [%]": f"{100 * line['low']:.0f} to {100 * line['high']:.0f}",
+                "federated ahead by [points]": ahead.get("points", ""),
+                "behind federated": behind(part, counted["federated"]),
+            }
+        )
+    return found
+
+
+def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> dict[str, str]:
+    """Return the paired difference between federated and an arm; a pair is a task and a start in one run."""
+    both = pd.concat([counted["federated"], counted[name].assign(arm=name)])
+    paired = both.assign(task=both.run.astype(str) + both.task)
+    result = paired_difference(paired, "federated", name, seed=0)
+    return {"points": f"{100 * result['difference']:+.0f} ({100 * result['low']:+.0f} to {100 * result['high']:+.0f})"}
+
+
+def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
+    """Say how many models of an arm succeeded less often than the federated model of their run."""
+    rates, ours = part.groupby(["run", "arm"]).success.mean(), federated.groupby("run").success.mean()
+    return f"{sum(rate < ours[run] for (run, _), rate in rates.items())} of {len(rates)}"
+
+
+if __name__ == "__main__":
+    main()
