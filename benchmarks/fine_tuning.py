@@ -19,7 +19,7 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--tasks", default="lift,place,push", help="tasks, each learned alone, from the base")
     parser.add_argument("--demonstrations", type=int, default=50, help="episodes of each task")
-    parser.add_argument("--steps", type=int, default=600, help="optimiser steps")
+    parser.add_argument("--steps", type=int, default=1200, help="optimiser steps")
     parser.add_argument("--rollouts", type=int, default=100, help="attempts at each task")
     chosen = parser.parse_args()
     config = laptop(chosen.profile, tasks=chosen.tasks, episodes_per_task=chosen.demonstrations)
