@@ -35,14 +35,12 @@ TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
 # Pages that end with results of benchmarks that were kept.
 RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
-    "book/reference_runs.md": ["four_arms"],
     "book/speed.md": [
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
     ],
 }  # fmt: skip
 TITLES = {
     "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
-    "four_arms": "who wins: federated, centralized, and every client alone",
     "floor": "the floor",
 }
 BENCHMARKS = "benchmarks/results"
