@@ -4,7 +4,7 @@
 """
 
 import torch
-from report import laptop, options, recording, report, timed
+from report import laptop, options, recording, report
 
 from fedvla_lib import data, model, prefix
 from fedvla_lib.compare import wilson
@@ -34,9 +34,7 @@ def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: in
     episodes = sorted(store.episodes.episode_id[store.episodes.task == task])
     bundle = model.load_policy(config, data.episode_stats(store, episodes))
     batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=config.seed)
-    supply = []
-    stored_s = timed(lambda: supply.append(prefix.stored(bundle, batches)))
-    result = local_train(bundle, supply[0], config, steps=steps, progress=False)
+    result = local_train(bundle, prefix.stored(bundle, batches), config, steps=steps, progress=False)
     actor = model.PolicyActor(bundle, config.seed)
     attempts = evaluate(actor, [task], rollout_seeds(rollouts), image_size=config.image_size, progress=False)
     successes = sum(attempt["success"] for attempt in attempts)
@@ -46,7 +44,6 @@ def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: in
         "demonstrations": len(episodes),
         "steps": steps,
         "training [s]": result.seconds,
-        "storing all prefixes once [s]": stored_s,
         "rollouts": rollouts,
         "successes": successes,
         "low [%]": 100 * low,
