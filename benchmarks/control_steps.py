@@ -3,7 +3,7 @@
     python benchmarks/control_steps.py
 """
 
-from report import laptop, median_seconds, options, report
+from report import laptop, median_seconds, options, report, start
 
 from fedvla_lib import scene
 from fedvla_lib.sim import HOME, So100Env
@@ -41,4 +41,4 @@ def seconds_per_step(env: So100Env, chosen: object) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from flwr.app import Context, Message
 from flwr.clientapp import ClientApp
-from report import laptop, options, peak_memory_mb, recording, report, timed
+from report import laptop, options, peak_memory_mb, recording, report, start, timed
 
 from fedvla_lib import client_app, clients, engine
 from fedvla_lib.config import Config
@@ -74,4 +74,4 @@ class Watched:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -4,7 +4,7 @@
 """
 
 import torch
-from report import laptop, options, recording, report
+from report import laptop, options, recording, report, start
 
 from fedvla_lib import data, model, prefix
 from fedvla_lib.compare import wilson
@@ -52,4 +52,4 @@ def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: in
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

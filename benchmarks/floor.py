@@ -1,13 +1,13 @@
 """How far a training step is from what this machine's arithmetic allows.
 
-The floor is the step's floating-point operations over the rate at which the machine multiplies matrices of that kind of
-size; nothing that computes the same step in float32 on these cores can be faster.
+The floor is the floating-point operations of a step's matrix products over the rate at which one core of this machine
+multiplies matrices that fit into its cache: about what a step would take if it did nothing else.
 
     python benchmarks/floor.py
 """
 
 import torch
-from report import laptop, median_seconds, options, recording, report
+from report import laptop, median_seconds, options, recording, report, start
 from torch.utils.flop_counter import FlopCounterMode
 
 from fedvla_lib import data, model, prefix
@@ -62,4 +62,4 @@ def operations_per_second(repeats: int) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pandas as pd
-from report import cores, laptop, options, report
+from report import cores, laptop, options, report, start
 
 from fedvla_lib import arms, data
 from fedvla_lib.compare import paired_difference, success_table
@@ -73,7 +73,6 @@ def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
     found = []
     for name, part in counted.items():
         (line,) = success_table(part.assign(arm=name), ["arm"]).to_dict("records")
-        ahead = ahead_of(name, counted) if name in ("centralized", BEST) else {}
         found.append(
             {
                 "arm": name,
@@ -81,19 +80,19 @@ def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
                 "attempts": int(line["n"]),
                 "successes": int(line["successes"]),
                 "95 % interval [%]": f"{100 * line['low']:.0f} to {100 * line['high']:.0f}",
-                "federated ahead by [points]": ahead.get("points", ""),
+                "federated ahead by [points]": ahead_of(name, counted) if name in ("centralized", BEST) else "",
                 "behind federated": behind(part, counted["federated"]),
             }
         )
     return found
 
 
-def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> dict[str, str]:
-    """Return the paired difference between federated and an arm; a pair is a task and a start in one run."""
+def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
+    """Say how far federated is ahead of an arm, with interval; a pair is a task and a start in one run."""
     both = pd.concat([counted["federated"], counted[name].assign(arm=name)])
     paired = both.assign(task=both.run.astype(str) + both.task)
     result = paired_difference(paired, "federated", name, seed=0)
-    return {"points": f"{100 * result['difference']:+.0f} ({100 * result['low']:+.0f} to {100 * result['high']:+.0f})"}
+    return f"{100 * result['difference']:+.0f} ({100 * result['low']:+.0f} to {100 * result['high']:+.0f})"
 
 
 def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
@@ -103,4 +102,4 @@ def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -5,12 +5,14 @@ Both sides see the same frames in the same order and draw the same noise, so the
     python benchmarks/local_training.py
 """
 
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
-from report import laptop, options, recording, report, timed
+from report import laptop, options, recording, report, start, timed
 
 from fedvla_lib import data, model, prefix
 from fedvla_lib.config import Config
@@ -34,9 +36,10 @@ def main() -> None:
     stats = data.episode_stats(store, episodes)
 
     ours = model.load_policy(config, stats)
-    kept = []
-    stored_s = timed(lambda: kept.append(prefix.stored(ours, batches)))
-    our_losses, our_s = train(ours, config, (kept[0].at(step) for step in range(chosen.steps)), chosen.steps)
+    with tempfile.TemporaryDirectory() as fresh:  # what an earlier run has stored would cost nothing
+        stored_s = timed(lambda: prefix.ensure_prefixes(ours, store, Path(fresh), progress=False))
+    supply = prefix.stored(ours, batches)
+    our_losses, our_s = train(ours, config, (supply.at(step) for step in range(chosen.steps)), chosen.steps)
     samples = chosen.steps * config.batch_size
     rows = []
     for workers in chosen.workers:
@@ -99,4 +102,4 @@ def lerobot_batches(store: FrameStore, batches: data.Batches, steps: int, worker
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

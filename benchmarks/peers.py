@@ -14,7 +14,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from control_steps import seconds_per_step
-from report import laptop, options, report
+from report import laptop, options, report, start
 
 from fedvla_lib.sim import So100Env
 
@@ -95,4 +95,4 @@ def peer_seconds_per_step(peer: str, make: str, pixels: int, chosen: Namespace) 
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -5,7 +5,7 @@
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
-from report import laptop, median_seconds, options, recording, report
+from report import laptop, median_seconds, options, recording, report, start
 
 from fedvla_lib import data
 from fedvla_lib.record import REPO_ID
@@ -29,4 +29,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -10,11 +10,13 @@ import os
 import platform
 import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from fedvla_lib import data
+from fedvla_lib.cli import EXPECTED
 from fedvla_lib.config import Config, from_profile
 from fedvla_lib.run_folder import write_json
 from fedvla_lib.store import FrameStore, open_store
@@ -29,6 +31,14 @@ def options(text: str) -> argparse.ArgumentParser:
     parser.add_argument("--repeats", type=int, default=5, help="measurements of each side; the median counts")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the JSON file")
     return parser
+
+
+def start(main: Callable[[], None]) -> None:
+    """Run a script; bad input ends it with one line on stderr and exit status 1."""
+    try:
+        main()
+    except EXPECTED as error:
+        sys.exit(f"{Path(sys.argv[0]).name}: {' '.join(str(error).split())}")
 
 
 def recording(config: Config) -> FrameStore:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from report import laptop, options, report, timed
+from report import laptop, options, report, start, timed
 
 from fedvla_lib import evaluate, model
 from fedvla_lib.config import Config
@@ -68,4 +68,4 @@ def lerobot_eval(chosen: object, config: Config, folder: Path) -> tuple[float, l
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

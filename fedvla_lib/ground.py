@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from torch.nn.functional import binary_cross_entropy_with_logits, smooth_l1_loss
 
 from fedvla_lib.data import AUGMENT_STREAM, ORDER_STREAM, augmented, to_float
@@ -162,9 +161,8 @@ def _answers(bundle: Bundle, batch: dict[str, Any]) -> tuple[list[torch.Tensor],
     raw = {key: value for key, value in batch.items() if key not in (NAMED, PRESENT, PLACES)}
     keys_and_values, _ = prefill(bundle, raw)  # (B, layers, 2, heads, L, head dim)
     values = [layer.transpose(1, 2).flatten(2) for layer in keys_and_values[:, :, 1].unbind(1)]
-    words = bundle.preprocess(raw)[OBS_LANGUAGE_TOKENS].shape[1]
     row, token, _ = batch[NAMED].T
-    place = values[0].shape[1] - 1 - words + token  # pictures, words, and one token for the state
+    place = batch[PRESENT].shape[1] + token  # the tokens of the pictures come first, then the words
     probes = bundle.policy.probes
     return values, [probes[f"phrase_{layer}"](values[layer][row, place]) for layer in _read_layers(bundle)]
 

@@ -125,7 +125,7 @@ class So100Env(gymnasium.Env):
             options: ``"color"`` fixes the first cube's colour, ``"joints"`` where the arm starts, (6,), LeRobot units.
 
         Raises:
-            ValueError: unknown colour.
+            ValueError: unknown colour, or joints that are not six finite numbers.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -134,7 +134,8 @@ class So100Env(gymnasium.Env):
         self.layout = draw_layout(self._task, self.np_random, options.get("color"))
         mujoco.mj_resetData(self.model, self.data)
         furnish(self.model, self.lab)
-        self._put_arm(options.get("joints", HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)))
+        home = HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)
+        self._put_arm(_check_joints(options.get("joints", home), "joints"))
         arrange(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
@@ -149,7 +150,7 @@ class So100Env(gymnasium.Env):
             ValueError: `action` is not six finite numbers.
             RuntimeError: the episode is over or never began.
         """
-        target = _check_action(action) - self.joint_offset
+        target = _check_joints(action, "action") - self.joint_offset
         if self._needs_reset:
             raise RuntimeError("the episode is over: call reset() before step()")
         low, high = self.action_space.low, self.action_space.high
@@ -343,13 +344,13 @@ def from_radians(angles_rad: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
     return np.append(np.rad2deg(angles_rad[:-1]) + ZERO_DEG, gripper).astype(np.float32)
 
 
-def _check_action(action: np.ndarray) -> np.ndarray:
-    target = np.asarray(action, dtype=np.float64)
+def _check_joints(values: np.ndarray, what: str) -> np.ndarray:
+    target = np.asarray(values, dtype=np.float64)
     if target.shape != (NUM_JOINTS,):
-        raise ValueError(f"action has shape {target.shape}: give ({NUM_JOINTS},), one target for each of {JOINTS}")
+        raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one target for each of {JOINTS}")
     for name, value in zip(JOINTS, target, strict=True):
         if not np.isfinite(value):
-            raise ValueError(f"action for {name} is {value}: give a finite number")
+            raise ValueError(f"{what} for {name} is {value}: give a finite number")
     return target
 
 

@@ -62,6 +62,13 @@ def test_every_client_is_compared_with_the_federation(tmp_path):
     assert kept.stat().st_mtime_ns == before  # not measured again
 
 
+def test_bad_input_is_one_line_that_names_it(tmp_path):
+    command = [sys.executable, str(FOLDER / "fine_tuning.py"), "--tasks", "juggle", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode and "juggle" in done.stderr and "lift" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1 and not list(tmp_path.iterdir())
+
+
 def test_a_federation_is_measured_against_its_clients(tmp_path):
     (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0

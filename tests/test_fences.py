@@ -19,7 +19,7 @@ FENCES = {
     "mujoco": {"sim", "scene", "expert"},
     "mink": {"expert"},
     "torch": {"model", "params", "train", "prefix", "data", "ground"},
-    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env", "ground"},
+    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env"},
     "flwr": {"wire", "roster", "strategies", "engine"} | APPS,
     "flwr_datasets": {"partition"},
     "matplotlib": {"plots"},

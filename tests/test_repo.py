@@ -13,7 +13,7 @@ pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parent.parent
 SUFFIXES = {".py", ".md", ".toml", ".yml", ".bib", ".ipynb", ".lock", ".css", ".svg", ""}
 # Written in halves, so that this file does not contain what it looks for.
-REGISTRY_HOSTS = ["pypi" + ".org", "pythonhosted" + ".org", "files." + "pypi", "index-" + "url", "deb." + "debian"]
+REGISTRY_HOSTS = ["pyp" + "i.org", "pythonho" + "sted.org", "files.py" + "pi", "index-" + "url", "deb.deb" + "ian"]
 MACHINE_FOLDERS = ["ho" + "me", "ro" + "ot", "wo" + "rk", "Us" + "ers"]
 MACHINE_PATH = re.compile(rf"(?<![A-Za-z0-9_.$}}])/(?:{'|'.join(MACHINE_FOLDERS)})/")
 

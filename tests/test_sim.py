@@ -522,3 +522,12 @@ def test_two_processes_may_make_the_mesh_cache_at_once(tmp_path, monkeypatch):
     assert folders[0] == folders[1]
     assert [path.name for path in tmp_path.iterdir()] == [folders[0].name]  # no drafts left behind
     assert len(list(folders[0].glob("*.stl"))) >= 18
+
+
+def test_an_episode_can_start_in_another_pose():
+    env = So100Env("lift", cameras=(), render_mode=None)
+    pose = HOME + [20, 10, -10, 5, 0, 40]
+    env.reset(seed=0, options={"joints": pose})
+    np.testing.assert_allclose(env.joints, pose, atol=0.01)
+    with pytest.raises(ValueError, match=r"joints has shape \(5,\)"):
+        env.reset(seed=0, options={"joints": pose[:5]})
