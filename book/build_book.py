@@ -35,6 +35,7 @@ TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
 # Pages that end with results of benchmarks that were kept.
 RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
+    "book/reference_runs.md": ["four_arms"],
     "book/speed.md": [
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
     ],
@@ -42,8 +43,10 @@ RESULTS_ON = {
 TITLES = {
     "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
     "floor": "the floor",
+    "four_arms": "one federation after another, its clients alone, and centralized",
 }
 BENCHMARKS = "benchmarks/results"
+REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results, as chapters name it
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
@@ -71,8 +74,11 @@ def library_key(root: Path, profile: str) -> str:
 
 
 def notebook_key(notebook: Path, library: str) -> str:
-    """Return the digest that decides whether `notebook` has to be executed again."""
-    return _digest([library.encode(), notebook.name.encode(), notebook.read_bytes()])
+    """Return the digest that decides whether `notebook` has to be executed again: it, the library, what it reads."""
+    source = notebook.read_bytes()
+    folders = sorted({notebook.parent / name.decode() for name in REFERENCE.findall(source)})
+    stored = [path.name.encode() + b"\0" + path.read_bytes() for folder in folders for path in sorted(folder.glob("*"))]
+    return _digest([library.encode(), notebook.name.encode(), source, *stored])
 
 
 def _named_bytes(root: Path, path: Path) -> bytes:

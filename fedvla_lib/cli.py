@@ -57,6 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_run(commands)
     _add_evaluate(commands)
+    _add_experiment(commands)
     return parser
 
 
@@ -111,6 +112,13 @@ def _add_run(commands: Any) -> None:
     text = "inline: in this process, in a fixed order; simulation: Flower's runtime, several processes"
     parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
     _add_settings(parser)
+
+
+def _add_experiment(commands: Any) -> None:
+    kept = "finished cells are kept, the same command continues"
+    parser = _command(commands, "experiment", experiment, "train and measure a grid of arms and seeds", kept)
+    parser.add_argument("file", type=Path, help="what to measure: a TOML file, see fedvla_lib/experiment.py")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for one result file a cell")
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -279,6 +287,13 @@ def _engine(name: str) -> Callable[[Config], Path]:
     from fedvla_lib.engine import run_inline
 
     return run_inline
+
+
+def experiment(options: argparse.Namespace) -> None:
+    """Measure every cell of an experiment that has no result yet."""
+    from fedvla_lib.experiment import read_plan, run_plan
+
+    run_plan(read_plan(options.file), options.out)
 
 
 def evaluate(options: argparse.Namespace) -> None:

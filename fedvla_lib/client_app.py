@@ -11,8 +11,11 @@ from flwr.clientapp import ClientApp
 
 from fedvla_lib import clients, wire
 from fedvla_lib.config import from_run_config
+from fedvla_lib.corrections import ControlVariates, Correction, Parameters, Proximal
 from fedvla_lib.model import Bundle
-from fedvla_lib.params import digest, load_arrays, shapes_of, trainable_arrays
+from fedvla_lib.params import Arrays, digest, load_arrays, shapes_of, trainable, trainable_arrays
+
+MOMENTS = "moments"  # in a client's state: its optimiser's
 
 
 def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
@@ -33,19 +36,26 @@ def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
     def train(message: Message, context: Context) -> Message:
         client = _client(context, tools)
         bundle = _global_policy(client, message, tools)
-        result = client.train(bundle, message.content[wire.CONFIG][wire.ROUND])
+        order = message.content[wire.CONFIG]
+        correction = correction_for(message, context, trainable(bundle.policy))
+        moments = _recall(context, MOMENTS) if client.config.keep_optimizer else None
+        result = client.train(bundle, order[wire.ROUND], correction, moments)
         arrays = trainable_arrays(bundle.policy)
         metrics = {
             wire.EXAMPLES: result.num_examples,
             "loss": sum(result.losses) / len(result.losses),
             "seconds": result.seconds,
         }
-        content = {
+        records = {
             wire.ARRAYS: wire.pack_arrays(arrays),
             wire.METRICS: MetricRecord(metrics),
             wire.NOTE: wire.note(sha256=digest(arrays)),
         }
-        return Message(RecordDict(content), reply_to=message)
+        content = RecordDict(records)
+        hand_in(content, correction, context)
+        if client.config.keep_optimizer:
+            context.state[MOMENTS] = wire.pack_arrays(result.moments)
+        return Message(content, reply_to=message)
 
     @app.evaluate()
     def evaluate(message: Message, context: Context) -> Message:
@@ -68,11 +78,42 @@ def _client(context: Context, tools: clients.Tools) -> clients.Client:
     return clients.open_client(config, int(context.node_config[wire.PARTITION]), tools)
 
 
+def correction_for(message: Message, context: Context, parameters: Parameters) -> Correction | None:
+    """Return what the strategy asks to add to gradients: SCAFFOLD sends control variates, FedProx a weight.
+
+    Args:
+        parameters: what trains, by name, holding the global arrays of the message.
+
+    Raises:
+        ParameterError: the control variates that came are not usable.
+    """
+    if wire.CONTROL in message.content:
+        shapes = {name: tuple(parameter.shape) for name, parameter in parameters.items()}
+        server = wire.checked_arrays(message.content, wire.CONFIG, shapes, wire.CONTROL, also=(wire.ARRAYS,))
+        return ControlVariates(server, _recall(context, wire.CONTROL))
+    mu = message.content[wire.CONFIG].get(wire.PROXIMAL_MU, 0.0)
+    return Proximal(parameters, mu) if mu else None
+
+
+def hand_in(reply: RecordDict, correction: Correction | None, context: Context) -> None:
+    """Add to a training reply what the strategy needs beside the arrays, and keep what the client needs next time."""
+    if isinstance(correction, ControlVariates):
+        change = correction.change()
+        reply[wire.CONTROL] = wire.pack_arrays(change)
+        reply[wire.NOTE][wire.CONTROL_DIGEST] = digest(change)
+        context.state[wire.CONTROL] = wire.pack_arrays(correction.own_after())
+
+
+def _recall(context: Context, what: str) -> Arrays:
+    """What this client kept in an earlier round; Flower stores it with the client on every engine."""
+    return wire.unpack_arrays(context.state[what]) if what in context.state else {}
+
+
 def _global_policy(client: clients.Client, message: Message, tools: clients.Tools) -> Bundle:
     """Return the policy holding the global arrays of the message, once they have passed every check."""
     bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
     shapes = shapes_of(trainable_arrays(bundle.policy))
-    load_arrays(bundle.policy, wire.checked_arrays(message.content, wire.CONFIG, shapes))
+    load_arrays(bundle.policy, wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,)))
     return bundle
 
 

@@ -13,8 +13,10 @@ import numpy as np
 
 from fedvla_lib import data, model, partition, prefix, train
 from fedvla_lib.config import Config
+from fedvla_lib.corrections import Correction
 from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.lab import REFERENCE, Lab, labs
+from fedvla_lib.params import Arrays
 from fedvla_lib.tasks import ALL_TASKS
 from fedvla_lib.wire import unpack_stats
 
@@ -73,8 +75,19 @@ class Client:
         """Mean, standard deviation, range and count of state and action over the client's training episodes."""
         return data.episode_stats(self.store, self.share.train_ids)
 
-    def train(self, bundle: model.Bundle, round_number: int) -> train.TrainResult:
-        """Train for one round; data order and learning rate go on where the round before stopped."""
+    def train(
+        self,
+        bundle: model.Bundle,
+        round_number: int,
+        correction: Correction | None = None,
+        moments: Arrays | None = None,
+    ) -> train.TrainResult:
+        """Train for one round; data order and learning rate go on where the round before stopped.
+
+        Args:
+            correction: what the strategy adds to gradients.
+            moments: the optimiser's state after this client's last round; None starts each round afresh.
+        """
         config = self.config
         return train.local_train(
             bundle,
@@ -84,6 +97,8 @@ class Client:
             start_step=(round_number - 1) * config.local_steps,
             total_steps=config.num_server_rounds * config.local_steps,
             progress=False,
+            correction=correction,
+            moments=moments,
         )
 
     def batches(self) -> data.Batches:
@@ -192,6 +207,11 @@ def labs_of(store: data.FrameStore, episode_ids: Sequence[int], config: Config) 
 def client_seed(seed: int, partition_id: int) -> int:
     """Return the seed of a client's own random stream; streams of different clients and runs do not overlap."""
     return int(np.random.SeedSequence([seed, partition_id]).generate_state(1)[0])
+
+
+def is_validated(config: Config, round_number: int) -> bool:
+    """Whether the global model of a round is kept and measured: every `validate_every` rounds, and whenever it acts."""
+    return round_number % config.validate_every == 0 or rolls_out(config, round_number)
 
 
 def rolls_out(config: Config, round_number: int) -> bool:

@@ -31,6 +31,10 @@ class Config:
     fraction_train: float = 0.4  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
+    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian or scaffold
+    server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
+    server_momentum: float = 0.9  # fedavgm: share of the last server step that goes on
+    proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model
     # model
     base: str = "nano"  # 'nano' (pretrained, in this package), 'nano-random', a local folder or a hub id
     chunk_size: int = 16  # future actions predicted at once; 50 in smolvla_base
@@ -42,9 +46,11 @@ class Config:
     local_steps: int = 20  # optimiser steps of a client in a round
     batch_size: int = 32  # samples per optimiser step
     lr: float = 1e-3  # peak learning rate of AdamW; smolvla_base uses 1e-4
+    keep_optimizer: bool = False  # a client's optimiser goes on in its next round instead of starting afresh
     warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
     checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
     # evaluation
+    validate_every: int = 1  # rounds between global models that are kept and measured on held-out episodes
     eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 4  # rollouts per task of the global model at each evaluation
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
@@ -110,6 +116,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     },
 }
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
+STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "scaffold")
 
 
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
@@ -170,18 +177,21 @@ def check(config: Config) -> Config:
     positive = (
         "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
         "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
+        "validate_every",
     )  # fmt: skip
     for name in positive:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
     countable = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
+        "server_lr", "proximal_mu",
     )  # fmt: skip
     for name in countable:
         _require(getattr(config, name) >= 0, config, name, "0 or more")
-    for name in ("fraction_train", "fraction_evaluate", "val_fraction"):
+    for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum"):
         _require(0 <= getattr(config, name) <= 1, config, name, "a share from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a share above 0")
     _require(config.partition in PARTITIONS, config, "partition", f"one of {', '.join(PARTITIONS)}")
+    _require(config.strategy in STRATEGIES, config, "strategy", f"one of {', '.join(STRATEGIES)}")
     most = f"at most chunk_size={config.chunk_size}"
     _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", most)
     _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")

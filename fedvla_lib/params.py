@@ -22,13 +22,18 @@ class ParameterError(ValueError):
         self.kind = kind
 
 
+def trainable(policy: torch.nn.Module) -> dict[str, torch.nn.Parameter]:
+    """Return the parameters that train, by name, in the policy's own order: the live ones, not copies."""
+    return {name: parameter for name, parameter in policy.named_parameters() if parameter.requires_grad}
+
+
 def trainable_arrays(policy: torch.nn.Module) -> Arrays:
     """Return copies of all trainable parameters by name, float32, in the policy's own order.
 
     Raises:
         ValueError: the policy has no trainable parameter.
     """
-    arrays = {name: _to_numpy(p) for name, p in policy.named_parameters() if p.requires_grad}
+    arrays = {name: _to_numpy(parameter) for name, parameter in trainable(policy).items()}
     if not arrays:
         raise ValueError("the policy has no trainable parameter: unfreeze a part of it (train-expert-only, base)")
     return arrays
@@ -40,7 +45,7 @@ def load_arrays(policy: torch.nn.Module, arrays: Mapping[str, np.ndarray]) -> No
     Raises:
         ParameterError: a name, shape or dtype differs, or a value is not finite.
     """
-    parameters = {name: p for name, p in policy.named_parameters() if p.requires_grad}
+    parameters = trainable(policy)
     check_arrays(arrays, {name: tuple(p.shape) for name, p in parameters.items()})
     with torch.no_grad():
         for name, parameter in parameters.items():

@@ -537,3 +537,38 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xlabel("difference in success rate [points], 95 % bootstrap interval")
     ax.set_ylabel("pair of arms")
     return ax
+
+
+def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
+    """Draw each column of a table against its index; a column named ``optimum`` is a dotted line."""
+    ax = ax or _new_axes()
+    for i, name in enumerate(table.columns):
+        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": PALETTE[i % len(PALETTE)]}
+        ax.plot(table.index, table[name], label=name, **look)
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    ax.legend(frameon=False, ncols=min(4, table.shape[1]), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return ax
+
+
+def success_intervals(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw a success rate with its interval for each line; columns arm, partition, success_rate, low, high.
+
+    A partition has a colour and a place within the arm's row, so that arms can be compared in each.
+    """
+    arms, partitions = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.partition))
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 1.2 + 0.3 * len(arms) + 0.1 * len(table)), layout="constrained")
+    for i, partition in enumerate(partitions):
+        part = table[table.partition == partition]
+        rows = np.array([arms.index(arm) for arm in part.arm]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
+        errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
+        color = PALETTE[i % len(PALETTE)]
+        ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
+    ax.set_yticks(range(len(arms)), arms)
+    ax.invert_yaxis()
+    ax.set_xlim(-2, 102)
+    ax.set_xlabel("success rate [%], 95 % Wilson interval")
+    ax.set_ylabel("strategy")
+    ax.legend(frameon=False, ncols=len(partitions), loc="lower center", bbox_to_anchor=(0.5, 1.0), title="partition")
+    return ax

@@ -10,13 +10,12 @@ from typing import Any
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
 
-from fedvla_lib import clients, data, model, roster, run_folder, wire
+from fedvla_lib import clients, data, model, roster, run_folder, strategies, wire
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import evaluate, rollout_seeds, success_rate
 from fedvla_lib.lab import labs
 from fedvla_lib.params import load_arrays, shapes_of, trainable_arrays
 from fedvla_lib.run_folder import GLOBAL, RunFolder
-from fedvla_lib.strategies import CheckedFedAvg
 from fedvla_lib.tasks import check_tasks
 from fedvla_lib.wire import Rollouts
 
@@ -47,10 +46,12 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
     """
     check_tasks(task_names(config))
     store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
-    members, stats = _introduce(grid, config, run)
+    members, weights, stats = _introduce(grid, config, run)
     bundle = model.load_policy(config, stats)
     arrays = trainable_arrays(bundle.policy)
-    strategy = CheckedFedAvg(
+    strategy = strategies.build(
+        config,
+        weights,
         roster=members,
         shapes=shapes_of(arrays),
         report=run.log,
@@ -83,6 +84,8 @@ class Judge:
 
     def __call__(self, round_number: int, arrays: ArrayRecord) -> MetricRecord:
         """Save ``global_model/round_N``, measure it, and log what was found; round 0 is the model before training."""
+        if not clients.is_validated(self.config, round_number):
+            return MetricRecord({})
         started = time.perf_counter()
         load_arrays(self.bundle.policy, wire.unpack_arrays(arrays))
         model.save_policy(self.bundle, self.run.model_dir(round_number))
@@ -114,8 +117,11 @@ class Judge:
         }
 
 
-def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[roster.Roster, model.Stats]:
-    """Learn who holds which partition and pool their statistics: the only thing about the data that leaves a client."""
+def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[roster.Roster, dict[int, float], model.Stats]:
+    """Learn who holds which partition and how many frames, and pool the clients' statistics.
+
+    Nothing else about the data leaves a client. Returns the roster, each node's share of all frames, the statistics.
+    """
     nodes = roster.wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
     members, introductions = roster.call(grid, nodes, run.log, ROUND_TIMEOUT_S)
     if len(introductions) < config.min_replies:
@@ -125,7 +131,9 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[roster.Roste
         )
     for one in introductions:
         run.log(0, roster.client_name(one.partition_id), "data", {"num_examples": one.num_examples})
-    return members, data.pool_stats([one.stats for one in introductions])
+    whole = sum(one.num_examples for one in introductions)
+    weights = {node: one.num_examples / whole for node, one in zip(members.partition_of, introductions, strict=True)}
+    return members, weights, data.pool_stats([one.stats for one in introductions])
 
 
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:

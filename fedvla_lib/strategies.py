@@ -1,8 +1,9 @@
-"""Federated averaging that checks what it averages: what Flower's strategies lack, as a mixin over any of them.
+"""Strategies that check what they average: what Flower's lack, as a mixin over any of them, and SCAFFOLD.
 
-`Checked` leaves the averaging to Flower and adds four things around it: clients are drawn by partition, from a seed;
+`Checked` leaves the averaging to Flower and adds five things around it: clients are drawn by partition, from a seed;
 messages carry a SHA-256; each reply is checked and a bad one is left out by client name and reason; replies are summed
-in the order of their partitions, so that the result does not depend on who answered first.
+in the order of their partitions, so that the result does not depend on who answered first; and each round leaves a
+record of the bytes that travelled and of how far apart the clients moved.
 """
 
 import logging
@@ -12,12 +13,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from flwr.app import ArrayRecord, ConfigRecord, Message, MetricRecord
+from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
-from flwr.serverapp.strategy import FedAvg
+from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi
 
 from fedvla_lib import wire
-from fedvla_lib.params import ParameterError, Shapes, digest
+from fedvla_lib.config import Config
+from fedvla_lib.drift import geometry
+from fedvla_lib.params import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.roster import Report, Roster, TooFewReplies, answered
 from fedvla_lib.run_folder import GLOBAL
 from fedvla_lib.wire import Rollouts
@@ -42,13 +45,15 @@ class Checked:
     Args:
         roster: the clients that take part.
         shapes: names and shapes every reply must have.
-        report: receives ``rejected``, ``train``, ``evaluate`` and ``replies`` events.
+        report: receives ``rejected``, ``train``, ``evaluate``, ``drift`` and ``replies`` events.
         keep_rollouts: receives (round, client's name, rollouts) of each good evaluation reply.
         train_share, evaluate_share: share of the clients drawn in a round.
         min_replies: good training replies without which the run stops.
         seed: fixes who is drawn.
         **flower: passed on to the Flower strategy.
     """
+
+    _also: tuple[str, ...] = ()  # records of arrays a reply has beside the trained ones
 
     def __init__(
         self,
@@ -68,14 +73,17 @@ class Checked:
         self.train_share, self.evaluate_share = train_share, evaluate_share
         self.min_replies, self.seed = min_replies, seed
         self._asked: list[int] = []
+        self._sent_bytes = 0
+        self._global: Arrays = {}
 
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """Draw clients and address the global arrays, with their SHA-256, to each."""
         selection = self._select(self.train_share, server_round, 0)
-        config[wire.DIGEST] = digest(wire.unpack_arrays(arrays))
-        return super().configure_train(server_round, arrays, config, selection)
+        self._global = wire.unpack_arrays(arrays)
+        config[wire.DIGEST] = digest(self._global)
+        return self._counted(super().configure_train(server_round, arrays, config, selection))
 
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
@@ -85,7 +93,7 @@ class Checked:
         if not selection.node_ids:
             return []
         config[wire.DIGEST] = digest(wire.unpack_arrays(arrays))
-        return super().configure_evaluate(server_round, arrays, config, selection)
+        return self._counted(super().configure_evaluate(server_round, arrays, config, selection))
 
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
@@ -101,7 +109,9 @@ class Checked:
                 f"round {server_round}: {len(good)} of {len(self._asked)} training replies are good, "
                 f"min-replies={self.min_replies} are required; the rejected ones are in metrics.jsonl"
             )
-        return super().aggregate_train(server_round, good)
+        self._take(server_round, good)
+        arrays, metrics = super().aggregate_train(server_round, good)
+        return _as_float32(arrays), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the replies that pass; a client without held-out episodes has nothing to average."""
@@ -111,6 +121,18 @@ class Checked:
             self.keep_rollouts(server_round, name, wire.unpack_rollouts(reply.content))
         measured = [reply for reply in good if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
+
+    def _take(self, server_round: int, good: list[Message]) -> None:
+        """Look at the good training replies before they are averaged: report where each client went."""
+        name = self.roster.name
+        ends = {name(r.metadata.src_node_id): wire.unpack_arrays(r.content[wire.ARRAYS]) for r in good}
+        for who, values in geometry(self._global, ends).items():
+            self.report(server_round, who, "drift", values)
+
+    def _counted(self, messages: Iterable[Message]) -> list[Message]:
+        messages = list(messages)
+        self._sent_bytes = sum(wire.count_bytes(message.content) for message in messages)
+        return messages
 
     def _select(self, share: float, server_round: int, purpose: int) -> Selection:
         rng = np.random.default_rng([self.seed, server_round, purpose])
@@ -122,6 +144,7 @@ class Checked:
     ) -> list[Message]:
         """Return the good replies in the order of their partitions; report each reply, good or not, and the counts."""
         by_node = {reply.metadata.src_node_id: reply for reply in replies}
+        received = sum(wire.count_bytes(reply.content) for reply in by_node.values() if not reply.has_error())
         good, rejected = [], []
         for node in self._asked:  # ordered by partition
             try:
@@ -135,6 +158,7 @@ class Checked:
         counts = {f"rejected_{reason}": rejected.count(reason) for reason in sorted(set(rejected))}
         if self._asked:
             counted = {"to": kind, "good": len(good), "rejected": len(rejected)}
+            counted |= {"sent_bytes": self._sent_bytes, "received_bytes": received}
             self.report(server_round, GLOBAL, "replies", counted | counts)
         return good
 
@@ -146,7 +170,7 @@ class Checked:
         _check_metrics(reply, wire.TRAIN_METRICS)
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{wire.EXAMPLES}=0: a client without training frames has no weight")
-        wire.checked_arrays(reply.content, wire.NOTE, self.shapes)
+        wire.checked_arrays(reply.content, wire.NOTE, self.shapes, also=self._also)
 
 
 class CheckedFedAvg(Checked, FedAvg):
@@ -154,6 +178,98 @@ class CheckedFedAvg(Checked, FedAvg):
 
     The new global array is sum_k n_k w_k / sum_k n_k with n_k the training frames of client k.
     """
+
+
+class CheckedFedProx(Checked, FedProx):
+    """FedAvg whose clients add mu / 2 ||w - w_global||^2 to their loss (https://arxiv.org/abs/1812.06127)."""
+
+
+class CheckedFedAvgM(Checked, FedAvgM):
+    """FedAvg with momentum on the server (Hsu et al. 2019, https://arxiv.org/abs/1909.06335)."""
+
+
+class CheckedFedAdam(Checked, FedAdam):
+    """Adam on the server, the averaged update as its gradient (Reddi et al. 2021, https://arxiv.org/abs/2003.00295)."""
+
+
+class CheckedFedYogi(Checked, FedYogi):
+    """Yogi on the server: as FedAdam, with a second moment that grows more slowly (https://arxiv.org/abs/2003.00295)."""
+
+
+class CheckedFedMedian(Checked, FedMedian):
+    """The median of each coordinate, every client counting alike (Yin et al. 2018, https://arxiv.org/abs/1803.01498)."""
+
+
+class CheckedScaffold(Checked, FedAvg):
+    """SCAFFOLD (Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378): FedAvg with control variates.
+
+    The server keeps c = sum_k p_k c_k over all clients and sends it along; `corrections.ControlVariates` is the half
+    of a client. The paper weighs clients alike; here p_k = n_k / sum n, the weight that averaging gives a client,
+    because with other weights the optimum of the averaged loss would not be a fixed point. With equal clients this is
+    the paper's.
+
+    Args:
+        weights: p_k by node id, over all clients, whether drawn or not.
+        **checked: what `Checked` takes.
+    """
+
+    _also = (wire.CONTROL,)
+
+    def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
+        super().__init__(**checked)
+        self.weights = weights
+        self.control: Arrays = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
+
+    def configure_train(
+        self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
+    ) -> Iterable[Message]:
+        """Announce the control variate's SHA-256 beside the arrays'."""
+        config[wire.CONTROL_DIGEST] = digest(self.control)
+        return super().configure_train(server_round, arrays, config, grid)
+
+    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
+        if message_type == MessageType.TRAIN:
+            record[wire.CONTROL] = wire.pack_arrays(self.control)
+        return super()._construct_messages(record, node_ids, message_type)
+
+    def _take(self, server_round: int, good: list[Message]) -> None:
+        """Add the clients' changes to c, and leave in each reply what Flower averages."""
+        for reply in good:
+            change = wire.unpack_arrays(reply.content.pop(wire.CONTROL))
+            weight = np.float32(self.weights[reply.metadata.src_node_id])
+            self.control = {name: array + weight * change[name] for name, array in self.control.items()}
+        super()._take(server_round, good)
+
+    def _check_train(self, reply: Message) -> None:
+        super()._check_train(reply)
+        wire.checked_arrays(reply.content, wire.NOTE, self.shapes, wire.CONTROL, also=(wire.ARRAYS,))
+
+
+# What a strategy takes for the step size of the server, for arrays that start from a pretrained model. Flower's default
+# of 0.1 moves each weight by up to 0.1 a round, as far as these weights are from zero.
+SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01}
+ADAPTIVITY = 1e-3  # tau: added to the root of the second moment
+
+
+def build(config: Config, weights: dict[int, float], **checked: Any) -> Checked:
+    """Return the strategy that the settings name.
+
+    Args:
+        weights: each node's share of all training frames.
+        **checked: what `Checked` takes.
+    """
+    rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
+    if config.strategy == "fedprox":
+        return CheckedFedProx(proximal_mu=config.proximal_mu, **checked)
+    if config.strategy == "fedavgm":
+        return CheckedFedAvgM(server_learning_rate=rate, server_momentum=config.server_momentum, **checked)
+    if config.strategy == "fedadam":
+        return CheckedFedAdam(eta=rate, tau=ADAPTIVITY, **checked)
+    if config.strategy == "fedyogi":
+        return CheckedFedYogi(eta=rate, tau=ADAPTIVITY, **checked)
+    if config.strategy == "scaffold":
+        return CheckedScaffold(weights=weights, **checked)
+    return {"fedavg": CheckedFedAvg, "fedmedian": CheckedFedMedian}[config.strategy](**checked)
 
 
 def _check_evaluate(reply: Message) -> None:
@@ -174,6 +290,13 @@ def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
     for key, value in records[wire.METRICS].items():
         if isinstance(value, list) or not math.isfinite(value):
             raise ParameterError("metrics", f"{key}={value!r} is not a finite number")
+
+
+def _as_float32(arrays: ArrayRecord | None) -> ArrayRecord | None:
+    """Flower's adaptive strategies compute with float64 scalars, which makes float64 of every array."""
+    if arrays is None:
+        return None
+    return ArrayRecord({name: Array(np.asarray(array.numpy(), np.float32)) for name, array in arrays.items()})
 
 
 def _examples(reply: Message) -> Any:

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,7 +23,9 @@ from safetensors.torch import load_file, save_file
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, granted_threads
+from fedvla_lib.corrections import Correction
 from fedvla_lib.model import Bundle, predict_chunk
+from fedvla_lib.params import Arrays, trainable
 from fedvla_lib.prefix import PREFIX_KEY, prefix_loss
 from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES
 
@@ -52,6 +54,7 @@ class TrainResult:
     num_examples: int  # training frames of the client: its weight in federated averaging
     steps: int  # optimiser steps done in this call
     seconds: float  # wall time of this call
+    moments: Arrays = field(default_factory=dict)  # the optimiser's state by name, for who goes on from here
 
 
 def local_train(
@@ -66,6 +69,8 @@ def local_train(
     resume: bool = False,
     progress: bool = True,
     loss: Loss | None = None,
+    correction: Correction | None = None,
+    moments: Arrays | None = None,
 ) -> TrainResult:
     """Train the policy's trainable parameters in place for `steps` steps, from `start_step` of a schedule.
 
@@ -75,6 +80,9 @@ def local_train(
         checkpoint_dir: where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end.
         resume: continue from the newest checkpoint in `checkpoint_dir`; the result is bit for bit the same.
         loss: what to minimise; default the policy's own flow-matching loss.
+        correction: changes each gradient before it is clipped: FedProx, SCAFFOLD.
+        moments: the optimiser's state to go on from, as an earlier result has it; ``{}`` starts afresh and still
+            returns the state, None does neither.
 
     Raises:
         FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
@@ -83,18 +91,21 @@ def local_train(
     started = time.perf_counter()
     with _seeded(batches.seed, start_step):
         optimizer, scheduler = _optimizer(bundle, config, start_step, total_steps or start_step + steps)
+        _load_moments(bundle, optimizer, moments or {})
         losses = _restore(bundle, optimizer, scheduler, checkpoint_dir) if resume else []
         bundle.policy.train()
         bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
         for step in bar:
-            losses.append(_step(bundle, batches.at(start_step + step), optimizer, scheduler, loss or flow_loss))
+            value = (loss or flow_loss)(bundle, batches.at(start_step + step))
+            losses.append(_step(bundle, value, optimizer, scheduler, correction))
             if not np.isfinite(losses[-1]):
                 raise FloatingPointError(f"loss is {losses[-1]} at step {start_step + step}: lower lr={config.lr}")
             bar.set_postfix(loss=f"{losses[-1]:.3f}")
             if checkpoint_dir and _is_due(step + 1, steps, config.checkpoint_every):
                 _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoint_dir))
         bundle.policy.eval()
-    return TrainResult(losses, batches.num_examples, steps, time.perf_counter() - started)
+        after = {} if moments is None else _moments(bundle, optimizer)
+    return TrainResult(losses, batches.num_examples, steps, time.perf_counter() - started, after)
 
 
 @torch.no_grad()
@@ -139,14 +150,21 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.item()
 
 
-def _step(bundle: Bundle, batch: dict[str, Any], optimizer: torch.optim.Optimizer, scheduler: Any, loss: Loss) -> float:
-    value = loss(bundle, batch)
+def _step(
+    bundle: Bundle,
+    loss: torch.Tensor,
+    optimizer: torch.optim.Optimizer,
+    scheduler: Any,
+    correction: Correction | None = None,
+) -> float:
     optimizer.zero_grad(set_to_none=True)
-    value.backward()
-    torch.nn.utils.clip_grad_norm_(_trainable(bundle), bundle.policy.config.optimizer_grad_clip_norm)
+    loss.backward()
+    if correction:
+        correction(trainable(bundle.policy))
+    torch.nn.utils.clip_grad_norm_(trainable(bundle.policy).values(), bundle.policy.config.optimizer_grad_clip_norm)
     optimizer.step()
     scheduler.step()
-    return value.item()
+    return loss.item()
 
 
 def flow_loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
@@ -159,14 +177,28 @@ def flow_loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
     return prefix_loss(bundle, batch, noise, model.sample_time(shape[0], settings.device))
 
 
-def _trainable(bundle: Bundle) -> list[torch.nn.Parameter]:
-    return [p for p in bundle.policy.parameters() if p.requires_grad]
+def _moments(bundle: Bundle, optimizer: torch.optim.Optimizer) -> Arrays:
+    """Copies of the optimiser's tensors, named ``<parameter>|<exp_avg, exp_avg_sq or step>``."""
+    return {
+        f"{name}|{kind}": value.detach().cpu().numpy().copy()
+        for name, parameter in trainable(bundle.policy).items()
+        for kind, value in optimizer.state.get(parameter, {}).items()
+    }
+
+
+def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arrays) -> None:
+    """Put the optimiser where `_moments` found it."""
+    named = trainable(bundle.policy)
+    for key, value in moments.items():
+        name, kind = key.rsplit("|", 1)
+        device = "cpu" if kind == "step" else named[name].device  # PyTorch keeps the count of steps on the CPU
+        optimizer.state[named[name]][kind] = torch.from_numpy(value.copy()).to(device)
 
 
 def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
     """SmolVLA's AdamW and cosine-with-warm-up presets, at the run's rate and length, standing at `start_step`."""
     settings = bundle.policy.config
-    optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(_trainable(bundle))
+    optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
     floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of last to peak rate
     preset = replace(
         settings.get_scheduler_preset(),
@@ -210,7 +242,7 @@ def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[flo
     with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
         made = Path(scratch) / "checkpoint"
         save_training_state(made, len(losses), optimizer, scheduler)
-        weights = {n: p.detach().contiguous() for n, p in bundle.policy.named_parameters() if p.requires_grad}
+        weights = {name: p.detach().contiguous() for name, p in trainable(bundle.policy).items()}
         save_file(weights, made / WEIGHTS_FILE)
         (made / LOSSES_FILE).write_text(json.dumps(losses))
         shutil.rmtree(target, ignore_errors=True)
@@ -224,7 +256,7 @@ def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, folder: Path | None
         return []
     load_training_state(found[-1], optimizer, scheduler)
     saved = load_file(found[-1] / WEIGHTS_FILE)
-    own = {name: p for name, p in bundle.policy.named_parameters() if p.requires_grad}
+    own = trainable(bundle.policy)
     if set(saved) != set(own):
         raise ValueError(f"{found[-1]} holds {len(saved)} trainable arrays, the policy has {len(own)}: another setup")
     with torch.no_grad():

@@ -2,6 +2,7 @@
 
 Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
 Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
+SCAFFOLD adds ``control`` both ways: control variates, checked as the arrays are.
 """
 
 import json
@@ -13,18 +14,22 @@ from typing import Any
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
+from flwr.common.serde import recorddict_to_proto
 
 from fedvla_lib.params import Arrays, ParameterError, Shapes, check_arrays
 from fedvla_lib.spec import JOINT_NAMES
 
 ARRAYS = "arrays"
+CONTROL = "control"
 CONFIG = "config"
 METRICS = "metrics"
 NOTE = "note"
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
-DIGEST = "sha256"
+DIGEST = "sha256"  # of the arrays
+CONTROL_DIGEST = "sha256-control"
+PROXIMAL_MU = "proximal-mu"  # Flower's own key
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"
 ROLLOUT_NAME = re.compile(r"rollout_\w+\.(mp4|npz)", re.ASCII)
@@ -50,20 +55,36 @@ def unpack_arrays(record: ArrayRecord) -> Arrays:
     return {name: _decode(name, array) for name, array in record.items()}
 
 
-def checked_arrays(content: RecordDict, digest_in: str, shapes: Shapes) -> Arrays:
-    """Unpack ``arrays`` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
+def checked_arrays(
+    content: RecordDict, digest_in: str, shapes: Shapes, record: str = ARRAYS, also: tuple[str, ...] = ()
+) -> Arrays:
+    """Unpack `record` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
+
+    Args:
+        also: other records of arrays that may be there; more than these is an error.
 
     Raises:
         ParameterError: what is wrong, in one line.
     """
-    announced = content.config_records.get(digest_in, {}).get(DIGEST)
-    if list(content.array_records) != [ARRAYS]:
-        raise ParameterError("names", f"expected one record {ARRAYS!r} of arrays, got {list(content.array_records)}")
+    key = {ARRAYS: DIGEST, CONTROL: CONTROL_DIGEST}[record]
+    announced = content.config_records.get(digest_in, {}).get(key)
+    if record not in content.array_records or set(content.array_records) - {record, *also}:
+        found = list(content.array_records)
+        raise ParameterError("names", f"expected one record {record!r} of arrays, got {found}")
     if not isinstance(announced, str):
-        raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{DIGEST}")
-    arrays = unpack_arrays(content.array_records[ARRAYS])
+        raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{key}")
+    arrays = unpack_arrays(content.array_records[record])
     check_arrays(arrays, shapes, announced)
     return arrays
+
+
+def count_bytes(content: RecordDict) -> int:
+    """Return the bytes of a message's records: arrays as Flower counts them, all else as it is serialised.
+
+    (`ConfigRecord.count_bytes` fails on an empty list or text.)
+    """
+    rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
+    return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
 
 
 def pack_stats(stats: Stats) -> str:

@@ -53,6 +53,22 @@ def test_key_changes_with_everything_a_chapter_depends_on(project):
 
 
 @pytest.mark.unit
+def test_key_changes_with_the_stored_results_that_a_chapter_reads(project):
+    stored = project / "book" / "reference" / "runs"
+    stored.mkdir(parents=True)
+    (stored / "a.json").write_text("1")
+    notebook = project / "notebooks" / "one.ipynb"
+    keys = {}
+    for code in ("1 + 1", "'../book/reference/runs'"):
+        write_notebook(notebook, code=code)
+        (stored / "a.json").write_text("1")
+        before = build_book.notebook_key(notebook, "library")
+        (stored / "a.json").write_text("2")
+        keys[code] = build_book.notebook_key(notebook, "library") != before
+    assert list(keys.values()) == [False, True]
+
+
+@pytest.mark.unit
 def test_key_does_not_change_by_itself(project):
     assert build_book.library_key(project, "tiny") == build_book.library_key(project, "tiny")
 

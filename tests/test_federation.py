@@ -13,7 +13,7 @@ from flwr.clientapp import ClientApp
 from safetensors.numpy import load_file
 
 from fedvla_lib import client_app, clients, data, engine, model, run_folder, train, wire
-from fedvla_lib.config import from_profile
+from fedvla_lib.config import STRATEGIES, from_profile
 from fedvla_lib.evaluate import read_video
 from fedvla_lib.params import digest, shapes_of, trainable_arrays
 from fedvla_lib.roster import TooFewReplies
@@ -296,3 +296,54 @@ def test_rollouts_are_due_every_so_many_rounds_and_at_the_end():
 def test_client_streams_differ():
     seeds = {clients.client_seed(seed, k) for seed in range(5) for k in range(10)}
     assert len(seeds) == 50
+
+
+def last_weights(config):
+    return global_weights(engine.run_inline(config, progress=False, raise_errors=True), config.num_server_rounds)
+
+
+def test_every_strategy_trains_the_robot_policy_and_fedprox_without_weight_is_fedavg(tiny):
+    config = replace(tiny, num_clients=2, **NO_ROLLOUTS)
+    weights = {name: last_weights(replace(config, strategy=name, proximal_mu=0.0)) for name in STRATEGIES}
+    assert same(weights["fedprox"], weights["fedavg"])
+    different = [name for name in STRATEGIES if name != "fedprox"]
+    for i, left in enumerate(different):
+        for right in different[:i]:
+            if {left, right} != {"fedavg", "fedmedian"}:  # of two clients the median is the mean
+                assert not same(weights[left], weights[right]), (left, right)
+
+
+def test_the_proximal_term_changes_what_clients_learn(tiny):
+    config = replace(tiny, num_clients=2, strategy="fedprox", **NO_ROLLOUTS)
+    assert not same(last_weights(config), last_weights(replace(config, proximal_mu=0.0)))
+
+
+def test_a_kept_optimiser_goes_on_in_the_next_round(tiny):
+    settings = [replace(tiny, keep_optimizer=keep, **NO_ROLLOUTS) for keep in (True, False)]
+    kept, reset = (engine.run_inline(config, progress=False) for config in settings)
+    assert same(global_weights(kept, 1), global_weights(reset, 1))  # nothing to keep yet
+    assert not same(global_weights(kept, 2), global_weights(reset, 2))
+
+
+def test_a_run_records_what_travelled_and_how_far_clients_moved(tiny):
+    config = replace(tiny, num_clients=2, num_server_rounds=1, **NO_ROLLOUTS)
+    sizes = {}
+    for name in ("fedavg", "scaffold"):
+        root = engine.run_inline(replace(config, strategy=name), progress=False)
+        replies = run_folder.read_metrics(root, "replies").set_index("to")
+        sizes[name] = replies.loc["train", ["sent_bytes", "received_bytes"]].astype(int)
+        arrays = trainable_arrays(model.load_policy(replace(config, base=str(root / "global_model/round_1"))).policy)
+        payload = 2 * sum(array.nbytes for array in arrays.values())  # of both clients
+        copies = {"fedavg": 1, "scaffold": 2}[name]
+        assert (sizes[name] > copies * payload).all() and (sizes[name] < 1.05 * copies * payload).all()
+    drift = run_folder.read_metrics(root, "drift")
+    assert list(drift.who) == ["client_0", "client_1"] and (drift["norm.all"] > 0).all()
+    assert drift["toward.client_1"][0] == pytest.approx(drift["toward.client_0"][1])
+
+
+def test_global_models_are_kept_and_measured_as_often_as_asked(tiny):
+    config = replace(tiny, num_clients=2, num_server_rounds=5, validate_every=3, **NO_ROLLOUTS)
+    root = engine.run_inline(config, progress=False)
+    events = run_folder.read_metrics(root, "evaluate")
+    assert events[events.who == "global"]["round"].tolist() == [0, 3, 5]
+    assert {path.name for path in (root / "global_model").iterdir()} == {"round_0", "round_3", "round_5"}

@@ -226,3 +226,27 @@ def test_trajectories_of_different_length_share_the_clock():
     axes = plots.trajectories({"expert": np.zeros((11, 6)), "policy": np.ones((21, 6))})
     assert len(axes) == 6
     assert [line.get_xdata()[-1] for line in axes[0].lines] == pytest.approx([1.0, 2.0])
+
+
+def test_curves_draw_every_column_against_the_index():
+    table = pd.DataFrame({"a": [1.0, 2.0], "b": [3.0, 1.0]}, index=[0.5, 0.7])
+    ax = plots.curves(table, xlabel="w", ylabel="loss")
+    assert labelled(ax) and [line.get_label() for line in ax.lines] == ["a", "b"]
+    np.testing.assert_array_equal(ax.lines[1].get_xydata(), [[0.5, 3.0], [0.7, 1.0]])
+    marked = plots.curves(table.rename(columns={"b": "optimum"}), xlabel="w", ylabel="loss")
+    assert marked.lines[1].get_linestyle() == ":"
+
+
+def test_success_intervals_show_rate_and_both_ends_in_percent():
+    table = pd.DataFrame(
+        {"arm": ["a", "b", "a"], "partition": ["iid", "iid", "task"], "success_rate": [0.5, 0.8, 0.1],
+         "low": [0.4, 0.7, 0.0], "high": [0.6, 0.9, 0.3]}
+    )  # fmt: skip
+    ax = plots.success_intervals(table)
+    assert labelled(ax) and [text.get_text() for text in ax.get_yticklabels()] == ["a", "b"]
+    points = {c.get_label(): c.lines[0].get_xydata() for c in ax.containers}
+    np.testing.assert_allclose(points["iid"][:, 0], [50, 80])
+    np.testing.assert_allclose(points["task"][:, 0], [10])
+    (_, _, (bars,)) = ax.containers[1]
+    np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0, 30])
+    assert round(points["task"][0, 1]) == 0  # in the row of its arm

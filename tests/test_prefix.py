@@ -8,6 +8,7 @@ import torch
 
 from fedvla_lib import config as configs
 from fedvla_lib import data, model, prefix, train
+from fedvla_lib.params import trainable
 from fedvla_lib.spec import CAMERAS, STATE_KEY, image_key
 
 CONFIG = configs.from_profile("tiny", base="nano-random", num_threads=1)
@@ -33,10 +34,11 @@ def test_loss_and_gradients_equal_the_policys_own(store):
         noise = torch.randn(CONFIG.batch_size, CONFIG.chunk_size, 32)
         times = torch.rand(CONFIG.batch_size)
         expected, _ = bundle.policy.forward(bundle.preprocess(batch), noise=noise, time=times)
-        wanted = torch.autograd.grad(expected, train._trainable(bundle))
+        trained = list(trainable(bundle.policy).values())
+        wanted = torch.autograd.grad(expected, trained)
         actual = prefix.prefix_loss(bundle, stored.at(step), noise, times)
         assert actual.item() == pytest.approx(expected.item(), rel=1e-6)
-        for left, right in zip(wanted, torch.autograd.grad(actual, train._trainable(bundle)), strict=True):
+        for left, right in zip(wanted, torch.autograd.grad(actual, trained), strict=True):
             torch.testing.assert_close(left, right, rtol=1e-4, atol=1e-6)
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from fedvla_lib import config as configs
-from fedvla_lib import model, train
+from fedvla_lib import model, train, wire
+from fedvla_lib.params import load_arrays, trainable, trainable_arrays
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
 CONFIG = configs.from_profile("tiny", base="nano-random", checkpoint_every=2, num_threads=1, train_expert_only=False)
@@ -141,3 +142,41 @@ def test_a_diverging_loss_stops_with_a_clear_line():
 
     with pytest.raises(FloatingPointError, match="step 0: lower lr"):
         train.local_train(model.load_policy(CONFIG, STATS), Poison(), CONFIG, steps=1, progress=False)
+
+
+def _decay(bundle, batch):
+    """A loss that draws nothing, so that two phases can equal one."""
+    return sum(p.square().sum() for p in trainable(bundle.policy).values())
+
+
+@pytest.mark.unit
+def test_a_kept_optimiser_state_makes_two_phases_equal_to_one():
+    whole, parts, fresh = (model.load_policy(CONFIG, STATS) for _ in range(3))
+    common = {"total_steps": 6, "progress": False, "loss": _decay}
+    train.local_train(whole, SyntheticBatches(), CONFIG, steps=6, **common)
+    first = train.local_train(parts, SyntheticBatches(), CONFIG, steps=2, moments={}, **common)
+    travelled = wire.unpack_arrays(wire.pack_arrays(first.moments))  # as a client's context keeps it
+    train.local_train(parts, SyntheticBatches(), CONFIG, steps=4, start_step=2, moments=travelled, **common)
+    assert same(weights(whole), weights(parts))
+    for steps, start in ((2, 0), (4, 2)):
+        result = train.local_train(fresh, SyntheticBatches(), CONFIG, steps=steps, start_step=start, **common)
+        assert result.moments == {}  # nobody asked for it
+    assert not same(weights(whole), weights(fresh))
+
+
+@pytest.mark.unit
+def test_a_kept_optimiser_state_survives_a_resume(tmp_path):
+    bundle = model.load_policy(CONFIG, STATS)
+    before = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, moments={}, progress=False).moments
+    started = trainable_arrays(bundle.policy)
+    settings = {"start_step": 2, "total_steps": 6, "moments": before, "progress": False}
+    whole = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=4, **settings)
+    expected = weights(bundle)
+    load_arrays(bundle.policy, started)
+    train.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, checkpoint_dir=tmp_path, **settings)
+    load_arrays(bundle.policy, started)
+    again = train.local_train(
+        bundle, SyntheticBatches(), CONFIG, steps=4, checkpoint_dir=tmp_path, resume=True, **settings
+    )
+    assert same(expected, weights(bundle))
+    assert whole.moments and all(np.array_equal(whole.moments[key], again.moments[key]) for key in whole.moments)

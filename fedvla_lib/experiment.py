@@ -1,0 +1,179 @@
+"""A grid of arms, partitions and seeds from one small file, one result file a cell, resumable.
+
+::
+
+    profile = "laptop"          # settings that no cell names
+    seeds = [0, 1, 2]           # a seed fixes the partition, the clients drawn, batches and noise
+    rollouts = 50               # attempts at each task, for each cell
+    first_rollout_seed = 2_000_000
+
+    [settings]                  # of every cell
+    local_steps = 20
+
+    [partitions.by_task]        # every arm runs on every partition
+    partition = "task"
+
+    [arms.fedavg]               # a kind of training, and settings of its own
+    kind = "federated"          # base, federated, centralized or local-only
+
+    [[only]]                    # if there are any: cells that match none of them are left out
+    arm = "fedavg"
+    partition = "by_task"
+"""
+
+import json
+import re
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from fedvla_lib import arms, clients, data, run_folder
+from fedvla_lib.config import Config, from_profile, task_names
+from fedvla_lib.evaluate import evaluate, rollout_seeds
+from fedvla_lib.lab import labs
+from fedvla_lib.model import Bundle, PolicyActor
+
+KINDS = ("base", "federated", "centralized", "local-only")
+FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
+NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
+# A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
+QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_rollouts": 0, "checkpoint_every": 0}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training and its evaluation."""
+
+    arm: str
+    kind: str
+    partition: str
+    seed: int
+    config: Config
+    client: int = 0  # of a local-only cell
+
+    @property
+    def name(self) -> str:
+        """Name of the cell's file."""
+        return f"{self.partition}_{self.arm}_{self.seed}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an experiment file asks for."""
+
+    cells: list[Cell]
+    rollout_seeds: list[int] = field(default_factory=list)
+
+
+def read_plan(file: Path) -> Plan:
+    """Return the cells that an experiment file describes, seed by seed, so that an early stop leaves whole seeds.
+
+    Raises:
+        ValueError: the file cannot be parsed, or holds a name or value that cannot be used.
+    """
+    try:
+        told = tomllib.loads(Path(file).read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file}: {error}") from error
+    for name in ("arms", "partitions", "seeds", "rollouts"):
+        if not told.get(name):
+            raise ValueError(f"{file} lacks {name!r}: give one of each of arms, partitions, seeds and rollouts")
+    if unknown := sorted(set(told) - NAMES):
+        raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
+    cells = [cell for cell in _cells(told, Path(file)) if _wanted(cell, told.get("only", []))]
+    return Plan(cells, rollout_seeds(told["rollouts"], first=told.get("first_rollout_seed", 2_000_000)))
+
+
+def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
+    for seed in told["seeds"]:
+        for partition, of_partition in told["partitions"].items():
+            for arm, of_arm in told["arms"].items():
+                own = dict(of_arm)
+                kind = own.pop("kind", "federated")
+                if bad := [name for name in (partition, arm) if not FILE_NAME.fullmatch(name)]:
+                    raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
+                if kind not in KINDS:
+                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
+                settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
+                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings))
+
+
+def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:
+    return not only or any(all(getattr(cell, key) == value for key, value in rule.items()) for rule in only)
+
+
+def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print) -> None:
+    """Measure every cell that has no file in `out` yet; a file appears when its cell is complete."""
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    todo = [cell for cell in plan.cells if not (out / f"{cell.name}.json").exists()]
+    say(f"{len(plan.cells)} cells, {len(plan.cells) - len(todo)} of them in {out}")
+    for number, cell in enumerate(todo, 1):
+        began = time.perf_counter()
+        result = measure(cell, plan.rollout_seeds)
+        run_folder.write_atomically(out / f"{cell.name}.json", (json.dumps(result) + "\n").encode())  # on one line
+        rate = sum(result["rollouts"]["success"]) / len(plan.rollout_seeds) / len(task_names(cell.config))
+        say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {time.perf_counter() - began:.0f} s")
+
+
+def measure(cell: Cell, seeds: list[int]) -> dict[str, Any]:
+    """Train a cell's model, or find it in the cache, and return what is known of it and of its rollouts."""
+    config = _with_recording(cell.config)
+    began = time.perf_counter()
+    bundle, travelled = _train(cell, config)
+    trained = time.perf_counter()
+    store = clients.open_frames(config)
+    frames, held_out = clients.validate(bundle, store, clients.held_out_episodes(store, config), config)
+    where = labs(config.num_labs, config.seed)
+    actor = PolicyActor(bundle, config.seed)
+    rows = evaluate(actor, task_names(config), seeds, image_size=config.image_size, labs=where, progress=False)
+    steps = {"base": 0, "local-only": arms.steps_per_client(config)}.get(cell.kind, arms.total_steps(config))
+    return {
+        "arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "seed": cell.seed,
+        "config": asdict(cell.config), "gradient_steps": steps, "samples": steps * config.batch_size,
+        "held_out_frames": frames, "held_out": held_out, "bytes": travelled,
+        "train_s": trained - began, "evaluate_s": time.perf_counter() - trained,
+        "stamp": run_folder.first_stamp(cell.config, cell.kind) | {"status": "completed"},
+        "rollouts": {key: [row[key] for row in rows] for key in ("task", "lab", "seed", "success", "steps")},
+    }  # fmt: skip
+
+
+def _train(cell: Cell, config: Config) -> tuple[Bundle, int]:
+    """Return the model of a cell and the bytes that travelled for its training."""
+    if cell.kind == "federated":
+        folder = arms.federated(config, progress=False)
+        replies = run_folder.read_metrics(folder, "replies")
+        return arms.federated_policy(config), int(replies.sent_bytes.sum() + replies.received_bytes.sum())
+    if cell.kind == "centralized":
+        return arms.centralized(config, progress=False), 0
+    if cell.kind == "local-only":
+        return arms.local_only(config, cell.client, progress=False), 0
+    return arms.base(config), 0
+
+
+def _with_recording(config: Config) -> Config:
+    """One recording for all seeds: a run's seed fixes training, not the demonstrations."""
+    return config if config.data else replace(config, data=str(data.resolve(replace(config, seed=0))))
+
+
+def read_results(folder: Path) -> pd.DataFrame:
+    """Return a row for each rollout of each cell in `folder`, with what is known of the cell.
+
+    Raises:
+        ValueError: there is no result.
+    """
+    files = sorted(Path(folder).glob("*.json"))
+    if not files:
+        raise ValueError(f"no results in {folder}: make some with fedvla experiment")
+    tables = []
+    for file in files:
+        cell = json.loads(file.read_text())
+        known = {key: cell[key] for key in ("arm", "kind", "partition", "gradient_steps", "bytes", "train_s")}
+        known |= {"run": cell["seed"], "loss": cell["held_out"].get("loss")}
+        tables.append(pd.DataFrame(cell["rollouts"]).assign(**known))
+    return pd.concat(tables, ignore_index=True)

@@ -1,0 +1,242 @@
+"""What strategies add to local training, checked where the answer is known: on quadratics, and against autograd."""
+
+import numpy as np
+import pytest
+import torch
+from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.clientapp import ClientApp
+
+from fedvla_lib import strategies, wire
+from fedvla_lib.client_app import correction_for, hand_in
+from fedvla_lib.config import Config
+from fedvla_lib.corrections import ControlVariates, Proximal
+from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
+from fedvla_lib.params import digest
+from fedvla_lib.roster import Roster
+
+pytestmark = pytest.mark.unit
+CURVATURE, TARGET = (4.0, 1.0), (-1.0, 2.0)  # client k minimises CURVATURE[k] / 2 (w - TARGET[k])^2
+RATE, STEPS = 0.1, 5
+
+
+@pytest.fixture(autouse=True)
+def identity():
+    claim_identity()
+
+
+def parameter(value):
+    return torch.nn.Parameter(torch.as_tensor(value, dtype=torch.float32).clone())
+
+
+def local_phase(weight, k, correction=None, steps=STEPS):
+    """Plain gradient descent of client k, in place."""
+    optimizer = torch.optim.SGD([weight], lr=RATE)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (CURVATURE[k] / 2 * (weight - TARGET[k]).square().sum()).backward()
+        if correction:
+            correction({"w": weight})
+        optimizer.step()
+
+
+def quadratic_app(examples=(1, 1)) -> ClientApp:
+    """Two clients with different optima and curvatures, through the same code as the robot's clients."""
+    app = ClientApp()
+
+    @app.train()
+    def train(message: Message, context: Context) -> Message:
+        k = context.node_config["partition-id"]
+        weight = parameter(wire.unpack_arrays(message.content[wire.ARRAYS])["w"])
+        correction = correction_for(message, context, {"w": weight})
+        local_phase(weight, k, correction)
+        arrays = {"w": weight.detach().numpy()}
+        metrics = MetricRecord({wire.EXAMPLES: examples[k], "loss": 0.0, "seconds": 0.0})
+        note = wire.note(sha256=digest(arrays))
+        reply = RecordDict({wire.ARRAYS: wire.pack_arrays(arrays), wire.METRICS: metrics, wire.NOTE: note})
+        hand_in(reply, correction, context)
+        return Message(reply, reply_to=message)
+
+    return app
+
+
+def federate(rounds, examples=(1, 1), share=1.0, **settings):
+    """Run a strategy on the two quadratics from w = 0; return w after each round and the strategy."""
+    grid = InlineGrid(quadratic_app(examples), 2, {}, raise_errors=True)
+    nodes = grid.get_node_ids()
+    weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
+    strategy = strategies.build(
+        Config(**settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
+        report=lambda *_: None, keep_rollouts=lambda *_: None, train_share=share,
+    )  # fmt: skip
+    arrays, path = wire.pack_arrays({"w": np.zeros(1, np.float32)}), []
+    for server_round in range(1, rounds + 1):
+        replies = grid.send_and_receive(strategy.configure_train(server_round, arrays, ConfigRecord(), grid))
+        arrays, _ = strategy.aggregate_train(server_round, replies)
+        path.append(float(wire.unpack_arrays(arrays)["w"][0]))
+    return path, strategy
+
+
+def optimum(examples=(1, 1)):
+    pull = np.multiply(CURVATURE, examples)
+    return float(pull @ np.array(TARGET) / pull.sum())
+
+
+def shrink(k):
+    """Share of the distance to its own optimum that is left after a local phase of client k."""
+    return (1 - RATE * CURVATURE[k]) ** STEPS
+
+
+def test_fedavg_stops_at_a_biased_point_and_scaffold_at_the_optimum():
+    moved = np.array([1 - shrink(0), 1 - shrink(1)])
+    biased = float(moved @ np.array(TARGET) / moved.sum())  # where the two updates cancel
+    assert abs(biased - optimum()) > 0.3
+    assert federate(60, strategy="fedavg")[0][-1] == pytest.approx(biased, abs=1e-4)
+    assert federate(60, strategy="scaffold")[0][-1] == pytest.approx(optimum(), abs=1e-4)
+
+
+@pytest.mark.parametrize("examples", [(3, 1), (1, 9)])
+def test_scaffold_finds_the_optimum_of_the_weighted_loss(examples):
+    assert federate(80, examples, strategy="scaffold")[0][-1] == pytest.approx(optimum(examples), abs=1e-4)
+
+
+def test_scaffold_finds_the_optimum_when_one_client_of_two_is_drawn():
+    assert federate(150, share=0.5, strategy="scaffold")[0][-1] == pytest.approx(optimum(), abs=1e-3)
+
+
+def test_scaffold_equals_a_computation_by_hand():
+    w, server, own = 0.0, 0.0, [0.0, 0.0]
+    expected = []
+    for _ in range(3):
+        ends, fresh = [], []
+        for k in range(2):
+            y, gradients = w, []
+            for _ in range(STEPS):
+                gradients.append(CURVATURE[k] * (y - TARGET[k]))
+                y -= RATE * (gradients[-1] - own[k] + server)
+            ends.append(y)
+            fresh.append(own[k] - server + (w - y) / (STEPS * RATE))  # the paper's option II
+            assert fresh[-1] == pytest.approx(np.mean(gradients))
+        server += sum((new - old) / 2 for new, old in zip(fresh, own, strict=True))
+        own, w = fresh, sum(ends) / 2
+        expected.append(w)
+    path, strategy = federate(3, strategy="scaffold")
+    np.testing.assert_allclose(path, expected, rtol=1e-5)
+    np.testing.assert_allclose(strategy.control["w"], server, rtol=1e-5)
+
+
+def test_control_variates_sum_to_zero_over_clients():
+    rng = np.random.default_rng(0)
+    server = {"w": np.zeros(4, np.float32)}
+    own = [{}, {}, {}]
+    for _ in range(3):
+        changes = []
+        for k in range(3):
+            control = ControlVariates(server, own[k])
+            for _ in range(2):
+                weight = parameter(np.zeros(4))
+                weight.grad = torch.from_numpy(rng.normal(size=4).astype(np.float32))
+                control({"w": weight})
+            own[k] = control.own_after()
+            changes.append(control.change()["w"])
+        server = {"w": server["w"] + np.mean(changes, axis=0)}
+        assert np.abs(sum(c["w"] - server["w"] for c in own)).max() < 1e-6
+
+
+def test_a_parameter_without_gradient_has_a_control_variate_of_zero():
+    used, idle = parameter([1.0]), parameter([1.0])
+    used.grad = torch.tensor([2.0])
+    zeros = {"used": np.zeros(1, np.float32), "idle": np.zeros(1, np.float32)}
+    control = ControlVariates(zeros, {})
+    control({"used": used, "idle": idle})
+    assert control.own_after() == {"used": np.float32([2.0]), "idle": np.float32([0.0])}
+    assert idle.grad is None
+
+
+def test_the_proximal_pull_is_the_gradient_of_the_squared_distance():
+    anchor = torch.randn(5, generator=torch.Generator().manual_seed(0))
+    weight = parameter(anchor)
+    pull = Proximal({"w": weight}, mu=0.7)
+    with torch.no_grad():
+        weight += 1.0
+    (0.7 / 2 * (weight - anchor).square().sum()).backward()
+    expected = weight.grad.clone()
+    weight.grad.zero_()
+    pull({"w": weight})
+    torch.testing.assert_close(weight.grad, expected)
+    assert (weight.grad != 0).all()  # an anchor that is the live weights would pull nowhere
+
+
+def test_fedprox_without_weight_is_fedavg_to_the_last_bit():
+    assert federate(5, strategy="fedprox", proximal_mu=0.0)[0] == federate(5, strategy="fedavg")[0]
+
+
+def test_the_pull_shortens_what_clients_move_and_lessens_the_bias():
+    free, held = parameter([0.0]), parameter([0.0])
+    local_phase(free, 0)
+    local_phase(held, 0, Proximal({"w": held}, mu=5.0))
+    assert abs(held.item()) < 0.6 * abs(free.item())
+    biased, pulled = (federate(100, strategy=name, proximal_mu=5.0)[0][-1] for name in ("fedavg", "fedprox"))
+    assert abs(pulled - optimum()) < 0.8 * abs(biased - optimum())
+
+
+def test_fedavgm_without_momentum_and_with_rate_one_is_fedavg():
+    still = federate(5, strategy="fedavgm", server_momentum=0.0, server_lr=1.0)[0]
+    assert still == federate(5, strategy="fedavg")[0]
+
+
+def test_fedavgm_adds_up_what_the_server_did_before():
+    w, momentum, path = 0.0, 0.0, []
+    for _ in range(3):
+        averaged = np.mean([TARGET[k] + (w - TARGET[k]) * shrink(k) for k in range(2)])
+        momentum = 0.6 * momentum + (w - averaged)
+        w -= 0.5 * momentum
+        path.append(w)
+    np.testing.assert_allclose(
+        federate(3, strategy="fedavgm", server_momentum=0.6, server_lr=0.5)[0], path, rtol=1e-5
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["fedadam", "fedyogi"])
+def test_adaptive_strategies_equal_a_float64_reference(name):
+    w, m, v, path = 0.0, 0.0, 0.0, []
+    for step in range(1, 5):
+        update = np.mean([TARGET[k] + (w - TARGET[k]) * shrink(k) for k in range(2)]) - w
+        m = 0.9 * m + 0.1 * update
+        v = {
+            "fedadam": 0.99 * v + 0.01 * update**2,
+            "fedyogi": v - 0.01 * update**2 * np.sign(v - update**2),
+        }[name]
+        rate = 0.05 * np.sqrt(1 - 0.99 ** (step + 1)) / (1 - 0.9 ** (step + 1)) if name == "fedadam" else 0.05
+        w += rate * m / (np.sqrt(v) + 1e-3)
+        path.append(w)
+    found, _ = federate(4, strategy=name, server_lr=0.05)
+    np.testing.assert_allclose(found, path, rtol=1e-4)
+
+
+def test_the_median_ignores_weights():
+    path, _ = federate(1, (1, 100), strategy="fedmedian")
+    ends = [TARGET[k] * (1 - shrink(k)) for k in range(2)]
+    assert path[0] == pytest.approx(np.median(ends), rel=1e-5)
+
+
+def test_a_damaged_control_variate_is_rejected():
+    app = quadratic_app()
+    grid = InlineGrid(app, 2, {}, raise_errors=True)
+    nodes = grid.get_node_ids()
+    seen = []
+    strategy = strategies.build(
+        Config(strategy="scaffold"), dict.fromkeys(nodes, 0.5), shapes={"w": (1,)},
+        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
+        report=lambda _, who, kind, values: seen.append((who, kind, values.get("reason"))),
+        keep_rollouts=lambda *_: None,
+    )  # fmt: skip
+    start = wire.pack_arrays({"w": np.zeros(1, np.float32)})
+    replies = grid.send_and_receive(strategy.configure_train(1, start, ConfigRecord(), grid))
+    replies[1].content[wire.CONTROL] = wire.pack_arrays({"w": np.full(1, np.nan, np.float32)})
+    strategy.aggregate_train(1, replies)
+    assert ("client_1", "rejected", "non-finite") in seen and ("client_0", "train", None) in seen
+    assert strategy.control["w"] == pytest.approx(0.5 * FIRST_CONTROL)
+
+
+# Mean gradient of client 0's first local phase from w = 0, and nothing from client 1.
+FIRST_CONTROL = (0.0 - TARGET[0] * (1 - shrink(0))) / (STEPS * RATE)
