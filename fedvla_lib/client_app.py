@@ -14,8 +14,11 @@ from fedvla_lib.config import from_run_config
 from fedvla_lib.corrections import ControlVariates, Correction, Parameters, Proximal
 from fedvla_lib.model import Bundle
 from fedvla_lib.params import Arrays, digest, load_arrays, shapes_of, trainable, trainable_arrays
+from fedvla_lib.quantise import DOWNWARD, with_feedback
 
-MOMENTS = "moments"  # in a client's state: its optimiser's
+# What a client keeps in its state from round to round, beside SCAFFOLD's control variate.
+MOMENTS = "moments"  # its optimiser's
+LEFT_OVER = "left-over"  # of its changes, what rounding has kept from the server so far
 
 
 def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
@@ -36,11 +39,11 @@ def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
     def train(message: Message, context: Context) -> Message:
         client = _client(context, tools)
         bundle = _global_policy(client, message, tools)
-        order = message.content[wire.CONFIG]
+        order, start = message.content[wire.CONFIG], trainable_arrays(bundle.policy)
         correction = correction_for(message, context, trainable(bundle.policy))
         moments = _recall(context, MOMENTS) if client.config.keep_optimizer else None
         result = client.train(bundle, order[wire.ROUND], correction, moments)
-        arrays = trainable_arrays(bundle.policy)
+        arrays = _outgoing(trainable_arrays(bundle.policy), start, client.config.exchange, context)
         metrics = {
             wire.EXAMPLES: result.num_examples,
             "loss": sum(result.losses) / len(result.losses),
@@ -95,6 +98,16 @@ def correction_for(message: Message, context: Context, parameters: Parameters) -
     return Proximal(parameters, mu) if mu else None
 
 
+def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) -> Arrays:
+    """What a reply carries: the arrays themselves, or how they changed, in fewer bits."""
+    if exchange == "float32":
+        return arrays
+    change = {name: array - start[name] for name, array in arrays.items()}
+    encoded, left_over = with_feedback(change, _recall(context, LEFT_OVER), exchange)
+    context.state[LEFT_OVER] = wire.pack_arrays(left_over)
+    return encoded
+
+
 def hand_in(reply: RecordDict, correction: Correction | None, context: Context) -> None:
     """Add to a training reply what the strategy needs beside the arrays, and keep what the client needs next time."""
     if isinstance(correction, ControlVariates):
@@ -113,7 +126,9 @@ def _global_policy(client: clients.Client, message: Message, tools: clients.Tool
     """Return the policy holding the global arrays of the message, once they have passed every check."""
     bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
     shapes = shapes_of(trainable_arrays(bundle.policy))
-    load_arrays(bundle.policy, wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,)))
+    exchange = DOWNWARD[client.config.exchange]
+    arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,), exchange=exchange)
+    load_arrays(bundle.policy, arrays)
     return bundle
 
 

@@ -34,6 +34,7 @@ class Config:
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian or scaffold
     server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
     server_momentum: float = 0.9  # fedavgm: share of the last server step that goes on
+    exchange: str = "float32"  # bits that travel: float32, float16, or int8 (float16 on the way down)
     proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model
     # model
     base: str = "nano"  # 'nano' (pretrained, in this package), 'nano-random', a local folder or a hub id
@@ -116,6 +117,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     },
 }
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
+EXCHANGES = ("float32", "float16", "int8")
 STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "scaffold")
 
 
@@ -192,6 +194,7 @@ def check(config: Config) -> Config:
     _require(config.fraction_train > 0, config, "fraction_train", "a share above 0")
     _require(config.partition in PARTITIONS, config, "partition", f"one of {', '.join(PARTITIONS)}")
     _require(config.strategy in STRATEGIES, config, "strategy", f"one of {', '.join(STRATEGIES)}")
+    _require(config.exchange in EXCHANGES, config, "exchange", f"one of {', '.join(EXCHANGES)}")
     most = f"at most chunk_size={config.chunk_size}"
     _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", most)
     _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")

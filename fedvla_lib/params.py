@@ -78,7 +78,17 @@ def check_arrays(
     _check_names(set(arrays), set(reference_shapes))
     for name, shape in reference_shapes.items():
         _check_one(name, arrays[name], shape)
-    if expected_digest is not None and (found := digest(arrays)) != expected_digest:
+    if expected_digest is not None:
+        check_digest(arrays, expected_digest)
+
+
+def check_digest(arrays: Mapping[str, np.ndarray], expected_digest: str) -> None:
+    """Return if the arrays have the digest that was announced.
+
+    Raises:
+        ParameterError: they do not.
+    """
+    if (found := digest(arrays)) != expected_digest:
         raise ParameterError("hash", f"SHA-256 is {found[:12]}..., announced was {expected_digest[:12]}...")
 
 

@@ -60,6 +60,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
         evaluate_share=config.fraction_evaluate,
         min_replies=config.min_replies,
         seed=config.seed,
+        exchange=config.exchange,
     )
     strategy.start(
         grid,

@@ -21,6 +21,7 @@ from fedvla_lib import wire
 from fedvla_lib.config import Config
 from fedvla_lib.drift import geometry
 from fedvla_lib.params import Arrays, ParameterError, Shapes, digest
+from fedvla_lib.quantise import DOWNWARD, decode, encode
 from fedvla_lib.roster import Report, Roster, TooFewReplies, answered
 from fedvla_lib.run_folder import GLOBAL
 from fedvla_lib.wire import Rollouts
@@ -50,6 +51,7 @@ class Checked:
         train_share, evaluate_share: share of the clients drawn in a round.
         min_replies: good training replies without which the run stops.
         seed: fixes who is drawn.
+        exchange: how arrays are encoded on the way; see `quantise`.
         **flower: passed on to the Flower strategy.
     """
 
@@ -66,12 +68,13 @@ class Checked:
         evaluate_share: float = 1.0,
         min_replies: int = 1,
         seed: int = 0,
+        exchange: str = "float32",
         **flower: Any,
     ) -> None:
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.roster, self.shapes, self.report, self.keep_rollouts = roster, shapes, report, keep_rollouts
         self.train_share, self.evaluate_share = train_share, evaluate_share
-        self.min_replies, self.seed = min_replies, seed
+        self.min_replies, self.seed, self.exchange = min_replies, seed, exchange
         self._asked: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
@@ -82,7 +85,7 @@ class Checked:
         """Draw clients and address the global arrays, with their SHA-256, to each."""
         selection = self._select(self.train_share, server_round, 0)
         self._global = wire.unpack_arrays(arrays)
-        config[wire.DIGEST] = digest(self._global)
+        config[wire.DIGEST] = digest(self._downward(arrays))
         return self._counted(super().configure_train(server_round, arrays, config, selection))
 
     def configure_evaluate(
@@ -92,7 +95,7 @@ class Checked:
         selection = self._select(self.evaluate_share, server_round, 1)
         if not selection.node_ids:
             return []
-        config[wire.DIGEST] = digest(wire.unpack_arrays(arrays))
+        config[wire.DIGEST] = digest(self._downward(arrays))
         return self._counted(super().configure_evaluate(server_round, arrays, config, selection))
 
     def aggregate_train(
@@ -109,6 +112,8 @@ class Checked:
                 f"round {server_round}: {len(good)} of {len(self._asked)} training replies are good, "
                 f"min-replies={self.min_replies} are required; the rejected ones are in metrics.jsonl"
             )
+        for reply in good if self.exchange != "float32" else []:
+            self._restore(reply)
         self._take(server_round, good)
         arrays, metrics = super().aggregate_train(server_round, good)
         return _as_float32(arrays), metrics
@@ -121,6 +126,20 @@ class Checked:
             self.keep_rollouts(server_round, name, wire.unpack_rollouts(reply.content))
         measured = [reply for reply in good if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
+
+    def _downward(self, arrays: ArrayRecord) -> Arrays:
+        return encode(wire.unpack_arrays(arrays), DOWNWARD[self.exchange])
+
+    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
+        """Flower's, with arrays of as many bits as asked for; strategies have noted the unrounded ones by now."""
+        if self.exchange != "float32":
+            record[wire.ARRAYS] = wire.pack_arrays(self._downward(record[wire.ARRAYS]))
+        return super()._construct_messages(record, node_ids, message_type)
+
+    def _restore(self, reply: Message) -> None:
+        """Put into a reply that carries a change the arrays that it makes of the global ones."""
+        change = decode(wire.unpack_arrays(reply.content[wire.ARRAYS]), self.exchange)
+        reply.content[wire.ARRAYS] = wire.pack_arrays({name: self._global[name] + change[name] for name in change})
 
     def _take(self, server_round: int, good: list[Message]) -> None:
         """Look at the good training replies before they are averaged: report where each client went."""
@@ -170,7 +189,7 @@ class Checked:
         _check_metrics(reply, wire.TRAIN_METRICS)
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{wire.EXAMPLES}=0: a client without training frames has no weight")
-        wire.checked_arrays(reply.content, wire.NOTE, self.shapes, also=self._also)
+        wire.checked_arrays(reply.content, wire.NOTE, self.shapes, also=self._also, exchange=self.exchange)
 
 
 class CheckedFedAvg(Checked, FedAvg):

@@ -16,7 +16,8 @@ import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
-from fedvla_lib.params import Arrays, ParameterError, Shapes, check_arrays
+from fedvla_lib.params import Arrays, ParameterError, Shapes, check_arrays, check_digest
+from fedvla_lib.quantise import check_encoded, decode
 from fedvla_lib.spec import JOINT_NAMES
 
 ARRAYS = "arrays"
@@ -56,12 +57,18 @@ def unpack_arrays(record: ArrayRecord) -> Arrays:
 
 
 def checked_arrays(
-    content: RecordDict, digest_in: str, shapes: Shapes, record: str = ARRAYS, also: tuple[str, ...] = ()
+    content: RecordDict,
+    digest_in: str,
+    shapes: Shapes,
+    record: str = ARRAYS,
+    also: tuple[str, ...] = (),
+    exchange: str = "float32",
 ) -> Arrays:
     """Unpack `record` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
 
     Args:
         also: other records of arrays that may be there; more than these is an error.
+        exchange: how the arrays were encoded; they come back as float32.
 
     Raises:
         ParameterError: what is wrong, in one line.
@@ -74,8 +81,12 @@ def checked_arrays(
     if not isinstance(announced, str):
         raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{key}")
     arrays = unpack_arrays(content.array_records[record])
-    check_arrays(arrays, shapes, announced)
-    return arrays
+    if exchange == "float32":
+        check_arrays(arrays, shapes, announced)
+        return arrays
+    check_encoded(arrays, shapes, exchange)
+    check_digest(arrays, announced)
+    return decode(arrays, exchange)
 
 
 def count_bytes(content: RecordDict) -> int:

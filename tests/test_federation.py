@@ -13,7 +13,7 @@ from flwr.clientapp import ClientApp
 from safetensors.numpy import load_file
 
 from fedvla_lib import client_app, clients, data, engine, model, run_folder, train, wire
-from fedvla_lib.config import STRATEGIES, from_profile
+from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile
 from fedvla_lib.evaluate import read_video
 from fedvla_lib.params import digest, shapes_of, trainable_arrays
 from fedvla_lib.roster import TooFewReplies
@@ -347,3 +347,22 @@ def test_global_models_are_kept_and_measured_as_often_as_asked(tiny):
     events = run_folder.read_metrics(root, "evaluate")
     assert events[events.who == "global"]["round"].tolist() == [0, 3, 5]
     assert {path.name for path in (root / "global_model").iterdir()} == {"round_0", "round_3", "round_5"}
+
+
+def test_rounded_exchange_learns_the_same_for_fewer_bytes(tiny):
+    config = replace(tiny, num_clients=2, local_steps=4, **NO_ROLLOUTS)
+    losses, sizes = {}, {}
+    for exchange in EXCHANGES:
+        root = engine.run_inline(replace(config, exchange=exchange), progress=False, raise_errors=True)
+        replies = run_folder.read_metrics(root, "replies").query("to == 'train'")
+        sizes[exchange] = replies[["sent_bytes", "received_bytes"]].sum()
+        events = run_folder.read_metrics(root, "evaluate").query("who == 'global'")
+        losses[exchange] = events.loss.to_numpy()
+        assert run_folder.read_metrics(root, "rejected").empty
+    learned = losses["float32"][0] - losses["float32"][-1]
+    assert learned > 0
+    for exchange, down, up in (("float16", 0.5, 0.5), ("int8", 0.5, 0.25)):
+        assert abs(losses[exchange][-1] - losses["float32"][-1]) < 0.02 * learned
+        share = sizes[exchange] / sizes["float32"]
+        assert share.sent_bytes == pytest.approx(down, abs=0.03)
+        assert share.received_bytes == pytest.approx(up, abs=0.03)
