@@ -18,6 +18,7 @@ from fedvla_lib.quantise import DOWNWARD, with_feedback
 
 # What a client keeps in its state from round to round, beside SCAFFOLD's control variate.
 MOMENTS = "moments"  # its optimiser's
+OWN = "own"  # the parts of the model that are personal
 LEFT_OVER = "left-over"  # of its changes, what rounding has kept from the server so far
 
 
@@ -38,12 +39,12 @@ def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
     @app.train()
     def train(message: Message, context: Context) -> Message:
         client = _client(context, tools)
-        bundle = _global_policy(client, message, tools)
-        order, start = message.content[wire.CONFIG], trainable_arrays(bundle.policy)
-        correction = correction_for(message, context, trainable(bundle.policy))
+        bundle = _policy(client, message, tools, context)
+        order, start = message.content[wire.CONFIG], _shared(bundle)
+        correction = correction_for(message, context, {name: trainable(bundle.policy)[name] for name in start})
         moments = _recall(context, MOMENTS) if client.config.keep_optimizer else None
         result = client.train(bundle, order[wire.ROUND], correction, moments)
-        arrays = _outgoing(trainable_arrays(bundle.policy), start, client.config.exchange, context)
+        arrays = _outgoing(_shared(bundle), start, client.config.exchange, context)
         metrics = {
             wire.EXAMPLES: result.num_examples,
             "loss": sum(result.losses) / len(result.losses),
@@ -58,12 +59,15 @@ def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
         hand_in(content, correction, context)
         if client.config.keep_optimizer:
             context.state[MOMENTS] = wire.pack_arrays(result.moments)
+        if bundle.own:
+            trained = trainable_arrays(bundle.policy)
+            context.state[OWN] = wire.pack_arrays({name: trained[name] for name in bundle.own})
         return Message(content, reply_to=message)
 
     @app.evaluate()
     def evaluate(message: Message, context: Context) -> Message:
         client = _client(context, tools)
-        bundle = _global_policy(client, message, tools)
+        bundle = _policy(client, message, tools, context)
         examples, metrics = client.validate(bundle)
         content = {
             wire.METRICS: MetricRecord({wire.EXAMPLES: examples, **metrics}),
@@ -122,14 +126,19 @@ def _recall(context: Context, what: str) -> Arrays:
     return wire.unpack_arrays(context.state[what]) if what in context.state else {}
 
 
-def _global_policy(client: clients.Client, message: Message, tools: clients.Tools) -> Bundle:
-    """Return the policy holding the global arrays of the message, once they have passed every check."""
+def _policy(client: clients.Client, message: Message, tools: clients.Tools, context: Context) -> Bundle:
+    """Return the policy holding the global arrays of the message, once they have passed every check, and its own."""
     bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
-    shapes = shapes_of(trainable_arrays(bundle.policy))
     exchange = DOWNWARD[client.config.exchange]
+    shapes = shapes_of(_shared(bundle))
     arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,), exchange=exchange)
-    load_arrays(bundle.policy, arrays)
+    load_arrays(bundle.policy, arrays | (_recall(context, OWN) or bundle.own))
     return bundle
+
+
+def _shared(bundle: Bundle) -> Arrays:
+    """What trains and is everybody's."""
+    return {name: array for name, array in trainable_arrays(bundle.policy).items() if name not in bundle.own}
 
 
 def _rollouts(client: clients.Client, bundle: Bundle, round_number: int) -> ConfigRecord:

@@ -34,6 +34,7 @@ class Config:
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian or scaffold
     server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
     server_momentum: float = 0.9  # fedavgm: share of the last server step that goes on
+    personal: str = ""  # parts of the model that stay with each client, comma separated: projections, expert layer N
     exchange: str = "float32"  # bits that travel: float32, float16, or int8 (float16 on the way down)
     proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model
     # model
@@ -42,6 +43,8 @@ class Config:
     n_action_steps: int = 8  # actions of a chunk carried out before the model looks again
     freeze_vision_encoder: bool = True  # keep the vision encoder fixed
     train_expert_only: bool = True  # keep the whole vision-language model fixed, train expert and projections
+    lora_rank: int = 0  # train adapters of this rank beside the expert's weights instead of these; 0 trains the weights
+    lora_freeze_a: bool = False  # train only one of the two adapter matrices, which makes their average exact
     train_state_proj: bool = False  # also train the projection of the arm's state into the prefix
     # local training
     local_steps: int = 20  # optimiser steps of a client in a round
@@ -150,6 +153,11 @@ def task_names(config: Config) -> list[str]:
     return [name.strip() for name in config.tasks.split(",") if name.strip()]
 
 
+def personal_parts(config: Config) -> list[str]:
+    """Return the parts of the model that stay with each client as a list."""
+    return [name.strip() for name in config.personal.split(",") if name.strip()]
+
+
 def granted_threads(config: Config) -> int:
     """Return the torch threads to use: `num_threads`, or the cores this process may run on."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -185,7 +193,7 @@ def check(config: Config) -> Config:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
     countable = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
-        "server_lr", "proximal_mu",
+        "server_lr", "proximal_mu", "lora_rank",
     )  # fmt: skip
     for name in countable:
         _require(getattr(config, name) >= 0, config, name, "0 or more")

@@ -1,6 +1,6 @@
 """What ties a client's local steps to the federation: terms added to its gradients after each backward pass."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -36,7 +36,7 @@ class Proximal:
     def __call__(self, parameters: Parameters) -> None:
         """Add mu (w - w_global)."""
         if self._mu:
-            for name, parameter in _with_gradient(parameters):
+            for name, parameter in _with_gradient(parameters, self._anchor):
                 parameter.grad.add_(parameter.detach() - self._anchor[name], alpha=self._mu)
 
 
@@ -62,7 +62,7 @@ class ControlVariates:
     def __call__(self, parameters: Parameters) -> None:
         """Remember the gradients, then add c - c_k to them."""
         self._steps += 1
-        for name, parameter in _with_gradient(parameters):
+        for name, parameter in _with_gradient(parameters, self._shift):
             gradient = parameter.grad
             self._sum[name] = self._sum[name] + gradient if name in self._sum else gradient.clone()
             gradient.add_(self._shift[name].to(gradient.device))
@@ -77,5 +77,6 @@ class ControlVariates:
         return {name: array - self._own[name] for name, array in self.own_after().items()}
 
 
-def _with_gradient(parameters: Parameters) -> list[tuple[str, torch.nn.Parameter]]:
-    return [(name, parameter) for name, parameter in parameters.items() if parameter.grad is not None]
+def _with_gradient(parameters: Parameters, known: Container[str]) -> list[tuple[str, torch.nn.Parameter]]:
+    """Parameters to correct: not those that a backward pass did not reach, nor those that stay with the client."""
+    return [(name, p) for name, p in parameters.items() if p.grad is not None and name in known]

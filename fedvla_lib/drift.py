@@ -1,20 +1,12 @@
 """How far, and how differently, clients move from the same start: norms and angles of their updates."""
 
-import re
 from collections.abc import Mapping
 
 import numpy as np
 
-from fedvla_lib.params import Arrays
+from fedvla_lib.params import Arrays, layer_of
 
-LAYER = re.compile(r"lm_expert.*?\.layers\.(\d+)\.")
 WHOLE = "all"
-
-
-def layer_of(name: str) -> str:
-    """Return which part of SmolVLA a parameter belongs to: ``expert layer N``, or ``projections`` around the expert."""
-    found = LAYER.search(name)
-    return f"expert layer {found[1]}" if found else "projections"
 
 
 def geometry(start: Arrays, ends: Mapping[str, Arrays]) -> dict[str, dict[str, float]]:

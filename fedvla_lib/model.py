@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,10 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from safetensors import safe_open
 
-from fedvla_lib.config import Config, cache_dir, granted_threads
+from fedvla_lib.config import Config, cache_dir, granted_threads, personal_parts
+from fedvla_lib.lora import add_adapters, merged
 from fedvla_lib.nano import ensure_nano
+from fedvla_lib.params import Arrays, layer_of, trainable_arrays
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
 
 POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
@@ -50,6 +52,7 @@ class Bundle:
     policy: SmolVLAPolicy
     preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
     postprocess: Any  # normalised actions -> degrees and gripper 0-100
+    own: Arrays = field(default_factory=dict)  # what is personal, as it was when the policy was loaded
 
 
 def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
@@ -66,8 +69,25 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
         raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
     source = str(nano_base()) if config.base == NANO else config.base
     policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
+    if config.lora_rank:
+        add_adapters(policy, config.lora_rank, freeze_a=config.lora_freeze_a, seed=config.seed)
     policy.eval()
-    return Bundle(policy, *_processors(policy, stats, source))
+    return Bundle(policy, *_processors(policy, stats, source), _own(policy, personal_parts(config)))
+
+
+def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
+    """The arrays of the parts that stay with a client.
+
+    Raises:
+        ValueError: a part that nothing trainable belongs to, or nothing is left to share.
+    """
+    arrays = trainable_arrays(policy) if parts else {}
+    known = sorted({layer_of(name) for name in arrays})
+    if unknown := [part for part in parts if part not in known]:
+        raise ValueError(f"personal={unknown[0]!r} is not a part that trains: choose from {', '.join(known)}")
+    if parts and set(parts) == set(known):
+        raise ValueError(f"personal={', '.join(parts)!r} leaves nothing to share: leave out one of {', '.join(known)}")
+    return {name: array for name, array in arrays.items() if layer_of(name) in parts}
 
 
 def nano_base() -> Path:
@@ -130,7 +150,7 @@ MODULES = {
 
 
 def save_policy(bundle: Bundle, folder: Path) -> None:
-    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically.
+    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, adapters merged in.
 
     Raises:
         FileExistsError: `folder` is there already; nothing is overwritten.
@@ -141,7 +161,7 @@ def save_policy(bundle: Bundle, folder: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch:
         target = Path(scratch) / "policy"
-        bundle.policy.save_pretrained(target)
+        merged(bundle.policy).save_pretrained(target)
         bundle.preprocess.save_pretrained(target)
         bundle.postprocess.save_pretrained(target)
         backbone = Path(bundle.policy.config.vlm_model_name)

@@ -5,6 +5,7 @@ the policy computes in. This module knows torch and NumPy; it does not know Flow
 """
 
 import hashlib
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 
 Arrays = dict[str, np.ndarray]
 Shapes = dict[str, tuple[int, ...]]
+LAYER = re.compile(r"lm_expert.*?\.layers\.(\d+)\.")
 
 
 class ParameterError(ValueError):
@@ -50,6 +52,12 @@ def load_arrays(policy: torch.nn.Module, arrays: Mapping[str, np.ndarray]) -> No
     with torch.no_grad():
         for name, parameter in parameters.items():
             parameter.copy_(torch.from_numpy(np.array(arrays[name])))  # a copy: torch wants writable memory
+
+
+def layer_of(name: str) -> str:
+    """Return which part of SmolVLA a parameter belongs to: ``expert layer N``, or ``projections`` around the expert."""
+    found = LAYER.search(name)
+    return f"expert layer {found[1]}" if found else "projections"
 
 
 def shapes_of(arrays: Mapping[str, np.ndarray]) -> Shapes:

@@ -48,7 +48,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
     store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
     members, weights, stats = _introduce(grid, config, run)
     bundle = model.load_policy(config, stats)
-    arrays = trainable_arrays(bundle.policy)
+    arrays = {name: array for name, array in trainable_arrays(bundle.policy).items() if name not in bundle.own}
     strategy = strategies.build(
         config,
         weights,
@@ -75,7 +75,10 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
 
 @dataclass(frozen=True)
 class Judge:
-    """Keeps and measures the global model after each round: held-out loss, action error, closed-loop success."""
+    """Keeps and measures the global model after each round: held-out loss, action error, closed-loop success.
+
+    Where parts of the model are personal, the global model has them as they were before training.
+    """
 
     config: Config
     store: data.FrameStore
@@ -88,7 +91,7 @@ class Judge:
         if not clients.is_validated(self.config, round_number):
             return MetricRecord({})
         started = time.perf_counter()
-        load_arrays(self.bundle.policy, wire.unpack_arrays(arrays))
+        load_arrays(self.bundle.policy, wire.unpack_arrays(arrays) | self.bundle.own)
         model.save_policy(self.bundle, self.run.model_dir(round_number))
         held_out = clients.held_out_episodes(self.store, self.config)
         frames, values = clients.validate(self.bundle, self.store, held_out, self.config)

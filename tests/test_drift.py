@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fedvla_lib.drift import geometry, layer_of
+from fedvla_lib.drift import geometry
+from fedvla_lib.params import layer_of
 
 pytestmark = pytest.mark.unit
 EXPERT = "model.vlm_with_expert.lm_expert.layers.{}.mlp.up_proj.weight"

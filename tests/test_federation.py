@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from fedvla_lib import client_app, clients, data, engine, model, run_folder, train, wire
 from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile
 from fedvla_lib.evaluate import read_video
-from fedvla_lib.params import digest, shapes_of, trainable_arrays
+from fedvla_lib.params import digest, layer_of, shapes_of, trainable_arrays
 from fedvla_lib.roster import TooFewReplies
 from fedvla_lib.spec import ACTION_KEY, STATE_KEY
 
@@ -44,8 +44,9 @@ def same(left, right) -> bool:
     return left.keys() == right.keys() and all(np.array_equal(left[name], right[name]) for name in left)
 
 
-def test_one_client_averaging_equals_local_training_bit_for_bit(tiny):
-    config = replace(tiny, num_clients=1, num_server_rounds=2, local_steps=3, **NO_ROLLOUTS)
+@pytest.mark.parametrize("rank", [0, 4])
+def test_one_client_averaging_equals_local_training_bit_for_bit(tiny, rank, tmp_path):
+    config = replace(tiny, num_clients=1, num_server_rounds=2, local_steps=3, lora_rank=rank, **NO_ROLLOUTS)
     federated = global_weights(engine.run_inline(config, progress=False), 2)
 
     store = clients.open_frames(config)
@@ -56,8 +57,8 @@ def test_one_client_averaging_equals_local_training_bit_for_bit(tiny):
     )
     for start_step in (0, 3):
         train.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
-    local = trainable_arrays(bundle.policy)
-    assert same({name: federated[name] for name in local}, local)
+    model.save_policy(bundle, tmp_path / "local")  # with adapters added in
+    assert same(federated, load_file(tmp_path / "local" / "model.safetensors"))
 
 
 def test_two_runs_with_one_seed_agree_bit_for_bit(tiny):
@@ -366,3 +367,37 @@ def test_rounded_exchange_learns_the_same_for_fewer_bytes(tiny):
         share = sizes[exchange] / sizes["float32"]
         assert share.sent_bytes == pytest.approx(down, abs=0.03)
         assert share.received_bytes == pytest.approx(up, abs=0.03)
+
+
+def test_personal_parts_stay_with_their_client(tiny):
+    config = replace(tiny, num_clients=2, personal="projections", **NO_ROLLOUTS)
+    seen = []
+
+    def watched(message, context):
+        reply = honest(message, context)
+        seen.append((message.metadata.message_type, context.node_config["partition-id"], message, reply, context))
+        return reply
+
+    honest = client_app.build(engine.remembering(clients.TOOLS))
+    app = ClientApp()
+    for kind in (app.query, app.train, app.evaluate):
+        kind()(watched)
+    root = engine.run_inline(config, clients_app=app, progress=False, raise_errors=True)
+    start, end = (global_weights(root, number) for number in (0, 2))
+    moved = {name for name in start if not np.array_equal(start[name], end[name])}
+    assert moved and {layer_of(name) for name in moved} == {f"expert layer {i}" for i in range(4)}
+    trained = [one for one in seen if one[0] == "train"]
+    for _, _, message, reply, _ in trained:
+        for arrays in (message.content[wire.ARRAYS], reply.content[wire.ARRAYS]):
+            assert "projections" not in {layer_of(name) for name in arrays}
+    own = [wire.unpack_arrays(context.state[client_app.OWN]) for _, _, _, _, context in trained[-2:]]
+    assert {layer_of(name) for name in own[0]} == {"projections"}
+    assert all(not np.array_equal(own[0][name], own[1][name]) for name in own[0])
+    assert all(not np.array_equal(own[0][name], start[name]) for name in own[0])
+
+
+def test_personal_parts_that_make_no_sense_are_refused(tiny):
+    everything = ",".join(["projections", *(f"expert layer {i}" for i in range(4))])
+    for parts, message in (("head", "'head'.*projections"), (everything, "nothing to share")):
+        with pytest.raises(ValueError, match=message):
+            model.load_policy(replace(tiny, personal=parts))

@@ -18,7 +18,7 @@ APPS = {"client_app", "server_app"}
 FENCES = {
     "mujoco": {"sim", "scene", "expert"},
     "mink": {"expert"},
-    "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections"},
+    "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections", "lora"},
     "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env"},
     "flwr": {"wire", "roster", "strategies", "engine"} | APPS,
     "flwr_datasets": {"partition"},
