@@ -43,7 +43,7 @@ class Config:
     n_action_steps: int = 8  # actions of a chunk carried out before the model looks again
     freeze_vision_encoder: bool = True  # keep the vision encoder fixed
     train_expert_only: bool = True  # keep the whole vision-language model fixed, train expert and projections
-    lora_rank: int = 0  # train adapters of this rank beside the expert's weights instead of these; 0 trains the weights
+    lora_rank: int = 0  # rank of adapters that train instead of the expert's weights; 0 trains the weights themselves
     lora_freeze_a: bool = False  # train only one of the two adapter matrices, which makes their average exact
     train_state_proj: bool = False  # also train the projection of the arm's state into the prefix
     # local training

@@ -15,22 +15,25 @@ from peft.tuners.lora import LoraLayer
 
 from fedvla_lib.params import Arrays
 
-# What LeRobot's own defaults adapt, without the state projection: while that is frozen a frame's prefix is constant.
-TARGETS = (
-    r"model\.(vlm_with_expert\.lm_expert\..*\.(q|v)_proj|action_in_proj|action_out_proj|action_time_mlp_in|"
-    r"action_time_mlp_out)"
-)
+EXPERT = r"vlm_with_expert\.lm_expert\..*\.(q|v)_proj"
+AROUND = "action_in_proj|action_out_proj|action_time_mlp_in|action_time_mlp_out"
 A, B = ".lora_A.default.weight", ".lora_B.default.weight"
 
 
-def add_adapters(policy: torch.nn.Module, rank: int, *, freeze_a: bool, seed: int) -> None:
+def add_adapters(
+    policy: torch.nn.Module, rank: int, *, freeze_a: bool = False, adapt_state: bool = False, seed: int = 0
+) -> None:
     """Put adapters of this rank into the policy, in place; they alone train, and at first they change nothing.
+
+    The matrices are those that LeRobot adapts by default: queries and values of the expert, and the projections.
 
     Args:
         freeze_a: train B only.
+        adapt_state: adapt the projection of the state as well; without, a frame's prefix stays constant.
         seed: fixes A, which has to be the same on every client.
     """
-    settings = LoraConfig(r=rank, lora_alpha=rank, target_modules=TARGETS, init_lora_weights=True)
+    targets = rf"model\.({EXPERT}|{AROUND}{'|state_proj' if adapt_state else ''})"
+    settings = LoraConfig(r=rank, lora_alpha=rank, target_modules=targets)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         inject_adapter_in_model(settings, policy)

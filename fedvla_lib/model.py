@@ -70,7 +70,8 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     source = str(nano_base()) if config.base == NANO else config.base
     policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
     if config.lora_rank:
-        add_adapters(policy, config.lora_rank, freeze_a=config.lora_freeze_a, seed=config.seed)
+        chosen = {"freeze_a": config.lora_freeze_a, "adapt_state": config.train_state_proj, "seed": config.seed}
+        add_adapters(policy, config.lora_rank, **chosen)
     policy.eval()
     return Bundle(policy, *_processors(policy, stats, source), _own(policy, personal_parts(config)))
 

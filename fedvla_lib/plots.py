@@ -572,3 +572,19 @@ def success_intervals(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_ylabel("strategy")
     ax.legend(frameon=False, ncols=len(partitions), loc="lower center", bbox_to_anchor=(0.5, 1.0), title="partition")
     return ax
+
+
+def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw success against what travelled, a labelled point a line; columns arm, MB, success_rate, low, high."""
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 4.6), layout="constrained")
+    for i, row in enumerate(table.itertuples()):
+        errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
+        color, marker = PALETTE[i % len(PALETTE)], "osD^vP*X"[i // len(PALETTE) % 8]
+        ax.errorbar(row.MB, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
+    ax.set_xscale("log")
+    ax.set_ylim(-2, 102)
+    ax.set_xlabel("everything that travelled [MB]")
+    ax.set_ylabel("success rate [%], 95 % Wilson interval")
+    ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    return ax

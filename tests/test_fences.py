@@ -18,8 +18,8 @@ APPS = {"client_app", "server_app"}
 FENCES = {
     "mujoco": {"sim", "scene", "expert"},
     "mink": {"expert"},
-    "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections", "lora"},
-    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env"},
+    "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections", "lora", "full_size"},
+    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env", "full_size"},
     "flwr": {"wire", "roster", "strategies", "engine"} | APPS,
     "flwr_datasets": {"partition"},
     "matplotlib": {"plots"},

@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from fedvla_lib import clients, data, lora, model, train
+from fedvla_lib import clients, data, full_size, lora, model, train
 from fedvla_lib.config import from_profile
 from fedvla_lib.params import trainable_arrays
 
@@ -82,3 +82,11 @@ def test_averaging_a_and_b_apart_is_wrong_unless_a_is_shared():
     expected = np.linalg.norm(right - apart) / np.linalg.norm(right)
     assert lora.averaging_error([one, other], [0.5, 0.5])["m"] == pytest.approx(expected, rel=1e-5)
     assert expected > 0.1
+
+
+def test_the_full_model_has_the_published_number_of_trainable_parameters():
+    policy = full_size.skeleton()
+    assert sum(p.numel() for p in policy.parameters()) == 450_046_176
+    assert sum(int(np.prod(shape)) for shape in full_size.travelling(policy).values()) == 99_880_992
+    lora.add_adapters(policy, 16, adapt_state=True)
+    assert sum(int(np.prod(shape)) for shape in full_size.travelling(policy).values()) == 742_656

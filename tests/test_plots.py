@@ -250,3 +250,13 @@ def test_success_intervals_show_rate_and_both_ends_in_percent():
     (_, _, (bars,)) = ax.containers[1]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0, 30])
     assert round(points["task"][0, 1]) == 0  # in the row of its arm
+
+
+def test_success_by_bytes_names_every_point():
+    table = pd.DataFrame(
+        {"arm": ["a", "b"], "MB": [10.0, 100.0], "success_rate": [0.2, 0.9], "low": [0.1, 0.8], "high": [0.3, 1.0]}
+    )
+    ax = plots.success_by_bytes(table)
+    assert labelled(ax) and ax.get_xscale() == "log"
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b"]
+    np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata(), [[100, 90]])
