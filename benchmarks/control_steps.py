@@ -16,6 +16,7 @@ def main() -> None:
     chosen = parser.parse_args()
     config = laptop(chosen.profile)
     ours_s = seconds_per_step(So100Env("lift", config.image_size), chosen)
+    blind_s = seconds_per_step(So100Env("lift", config.image_size, cameras=(), render_mode=None), chosen)
     scene.VISUAL_FACES = 10**9  # no mesh has more, so all are used as they are
     whole = So100Env("lift", config.image_size)
     whole_s = seconds_per_step(whole, chosen)
@@ -25,6 +26,7 @@ def main() -> None:
         "decimated [steps/s]": 1 / ours_s,
         "undecimated [steps/s]": 1 / whole_s,
         "ratio": whole_s / ours_s,
+        "no picture [steps/s]": 1 / blind_s,
     }
     report("control_steps", [row], chosen.out)
 

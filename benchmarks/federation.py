@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 from flwr.app import Context, Message
 from flwr.clientapp import ClientApp
@@ -16,6 +17,7 @@ from report import laptop, options, peak_memory_mb, recording, report, start, ti
 
 from fedvla_lib import client_app, clients, engine
 from fedvla_lib.config import Config
+from fedvla_lib.run_folder import read_metrics
 
 
 def main() -> None:
@@ -36,6 +38,8 @@ def main() -> None:
         "wall time [s]": whole["wall"],
         "clients' training and evaluation [s]": whole["clients"],
         "ratio of times": whole["wall"] / whole["clients"],
+        "server's own evaluation [s]": whole["judging"],
+        "ratio without it": (whole["wall"] - whole["judging"]) / whole["clients"],
         "peak memory [MB]": whole["memory"],
         "peak memory with one client [MB]": one["memory"],
         "ratio of memories": whole["memory"] / one["memory"],
@@ -57,7 +61,9 @@ def measure(config: Config) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as out:
         app = Watched(client_app.build(tools), inside)
         wall = timed(lambda: engine.run_inline(replace(config, out=out), clients_app=app, progress=False))
-    return {"wall": wall, "clients": sum(inside), "memory": peak_memory_mb()}
+        (run,) = Path(out).iterdir()
+        judged = read_metrics(run, "evaluate").query("who == 'global'").seconds.sum()
+    return {"wall": wall, "clients": sum(inside), "judging": float(judged), "memory": peak_memory_mb()}
 
 
 class Watched:

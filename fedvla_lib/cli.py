@@ -58,6 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_evaluate(commands)
     _add_experiment(commands)
+    _add_search(commands)
     return parser
 
 
@@ -119,6 +120,15 @@ def _add_experiment(commands: Any) -> None:
     parser = _command(commands, "experiment", experiment, "train and measure a grid of arms and seeds", kept)
     parser.add_argument("file", type=Path, help="what to measure: a TOML file, see fedvla_lib/experiment.py")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for one result file a cell")
+
+
+def _add_search(commands: Any) -> None:
+    kept = "finished trials are kept, the same command continues"
+    parser = _command(commands, "search", search, "search for settings of a federation at equal gradient steps", kept)
+    parser.add_argument("--trials", type=int, default=20, metavar="N", help="settings to try (default: 20)")
+    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="attempts at each task (default: 20)")
+    parser.add_argument("--search-out", type=Path, required=True, metavar="DIR", help="folder of trials and result")
+    _add_settings(parser)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -294,6 +304,19 @@ def experiment(options: argparse.Namespace) -> None:
     from fedvla_lib.experiment import read_plan, run_plan
 
     run_plan(read_plan(options.file), options.out)
+
+
+def search(options: argparse.Namespace) -> None:
+    """Search, and print the budget, the winner and what it is worth on what did not choose it."""
+    from fedvla_lib.search import search as search_settings
+
+    found = search_settings(settings(options), options.trials, options.rollouts, options.search_out)
+    print(f"{len(found['trials'])} trials of {found['budget']} gradient steps each")
+    print("winner: " + ", ".join(f"{name.replace('_', '-')}={value:.3g}" for name, value in found["winner"].items()))
+    for name in ("start", "best"):
+        line = found[name]
+        print(f"{name}: held-out loss {line['loss']:.3f}, {line['successes']} of {line['n']} rollouts succeed")
+    print(options.search_out / "search.json")
 
 
 def evaluate(options: argparse.Namespace) -> None:

@@ -123,7 +123,7 @@ def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print) -> None:
 
 def measure(cell: Cell, seeds: list[int]) -> dict[str, Any]:
     """Train a cell's model, or find it in the cache, and return what is known of it and of its rollouts."""
-    config = _with_recording(cell.config)
+    config = with_recording(cell.config)
     began = time.perf_counter()
     bundle, travelled = _train(cell, config)
     trained = time.perf_counter()
@@ -156,8 +156,8 @@ def _train(cell: Cell, config: Config) -> tuple[Bundle, int]:
     return arms.base(config), 0
 
 
-def _with_recording(config: Config) -> Config:
-    """One recording for all seeds: a run's seed fixes training, not the demonstrations."""
+def with_recording(config: Config) -> Config:
+    """Return settings that name the recording: one for all seeds, since a run's seed fixes training alone."""
     return config if config.data else replace(config, data=str(data.resolve(replace(config, seed=0))))
 
 

@@ -4,9 +4,11 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
-from fedvla_lib import run_folder, superlink
+from fedvla_lib import engine, run_folder, superlink
 from fedvla_lib.config import from_profile, from_run_config
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
@@ -28,7 +30,9 @@ def tiny(recording, tmp_path):
     )
 
 
-def test_three_clients_one_round_on_the_simulation_runtime(tiny):
+def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
+    """Two rounds with everything that a client keeps from one to the next: control variate, optimiser, remainder."""
+    tiny = replace(tiny, num_server_rounds=2, strategy="scaffold", keep_optimizer=True, exchange="int8")
     before = PYPROJECT.read_bytes()
     root = superlink.run_simulation(tiny, timeout_s=540)
     stamp = run_folder.read_stamp(root)
@@ -41,6 +45,10 @@ def test_three_clients_one_round_on_the_simulation_runtime(tiny):
     assert sorted(videos.index) == ["client_0", "client_1", "client_2"]
     assert all((root / video).stat().st_size > 1000 for video in videos)
     assert PYPROJECT.read_bytes() == before
+    inline = engine.run_inline(replace(tiny, client_rollouts=0), progress=False, raise_errors=True)
+    left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
+    assert left.keys() == right.keys()
+    assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
 
 
 def test_a_failed_run_is_an_error_with_flowers_reason(tiny):

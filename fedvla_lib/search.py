@@ -1,0 +1,109 @@
+"""Search for settings across clients at a fixed budget of gradient steps, with Optuna.
+
+Every trial spends the same steps. Settings are chosen by the held-out loss on one half of the validation episodes; what
+is reported of the winner, and of the settings that the search started from, comes from the other half and from rollouts
+that no trial has seen.
+"""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+
+from fedvla_lib import arms, clients, run_folder
+from fedvla_lib.config import Config, check, task_names
+from fedvla_lib.evaluate import evaluate, rollout_seeds
+from fedvla_lib.experiment import QUIET, with_recording
+from fedvla_lib.lab import labs
+from fedvla_lib.model import Bundle, PolicyActor
+from fedvla_lib.roster import draw_size
+
+ROLLOUTS_FROM = 3_000_000  # apart from the seeds of chapters and experiments
+LOCAL_STEPS = (1, 2, 5, 10, 20)
+SHARES = (0.1, 0.2, 0.4, 1.0)
+
+
+def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, Any]:
+    """Try `trials` settings, measure the best and the given ones, and return and write what was found.
+
+    Args:
+        config: where the search starts; its total of gradient steps is the budget of each trial.
+        trials: how many settings to try, those of earlier calls with the same `out` included.
+        rollouts: attempts at each task when the winner is measured.
+        out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
+
+    Raises:
+        ValueError: fewer than one trial, or `out` holds a search with other settings.
+    """
+    if trials < 1:
+        raise ValueError(f"trials={trials} is not usable: give a number above 0")
+    config, out = with_recording(replace(config, **QUIET, validate_every=10**6)), Path(out)
+    study = _open(config, out)
+    todo = trials - len(study.get_trials(states=[optuna.trial.TrialState.COMPLETE]))
+    study.optimize(lambda trial: _selection_loss(suggest(trial, config)), n_trials=max(0, todo), show_progress_bar=True)
+    budget = arms.total_steps(config)
+    found = {
+        "budget": budget, "trials": [_line(trial) for trial in study.trials if trial.value is not None],
+        "winner": study.best_params, "selection_loss": study.best_value,
+        "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
+    }  # fmt: skip
+    run_folder.write_json(out / "search.json", found)
+    return found
+
+
+def suggest(trial: Any, config: Config) -> Config:
+    """Return the settings of a trial: rate, local steps, clients a round, and what the strategy has to be told."""
+    local_steps = trial.suggest_categorical("local_steps", LOCAL_STEPS)
+    share = trial.suggest_categorical("fraction_train", SHARES)
+    rate = trial.suggest_float("lr", 2e-4, 5e-3, log=True)
+    chosen = {"lr": rate, "local_steps": local_steps, "fraction_train": share}
+    if config.strategy in ("fedavgm", "fedadam", "fedyogi"):
+        chosen["server_lr"] = trial.suggest_float("server_lr", 1e-3, 2.0, log=True)
+    if config.strategy == "fedprox":
+        chosen["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
+    a_round = local_steps * draw_size(share, config.num_clients)
+    return check(replace(config, **chosen, num_server_rounds=max(1, arms.total_steps(config) // a_round)))
+
+
+def report(config: Config, rollouts: int) -> dict[str, Any]:
+    """Measure settings on what did not choose them: the other validation episodes, and rollouts."""
+    bundle = arms.federated_policy(config)
+    actor, where = PolicyActor(bundle, config.seed), labs(config.num_labs, config.seed)
+    seeds = rollout_seeds(rollouts, first=ROLLOUTS_FROM)
+    rows = evaluate(actor, task_names(config), seeds, image_size=config.image_size, labs=where, progress=False)
+    return {
+        "loss": _loss(bundle, config, 1), "gradient_steps": arms.total_steps(config),
+        "n": len(rows), "successes": sum(row["success"] for row in rows),
+    }  # fmt: skip
+
+
+def _selection_loss(config: Config) -> float:
+    return _loss(arms.federated_policy(config), config, 0)
+
+
+def _loss(bundle: Bundle, config: Config, half: int) -> float:
+    """Held-out loss on every second validation episode, from the first or from the second on."""
+    store = clients.open_frames(config)
+    episodes = clients.held_out_episodes(store, config)[half::2]
+    return clients.validate(bundle, store, episodes, config)[1]["loss"]
+
+
+def _open(config: Config, out: Path) -> optuna.Study:
+    out.mkdir(parents=True, exist_ok=True)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = JournalStorage(JournalFileBackend(str(out / "trials.log")))
+    study = optuna.create_study(storage=storage, study_name="search", load_if_exists=True)
+    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))  # not the same draws again
+    wanted = json.dumps(asdict(replace(config, data="", num_threads=0)))
+    if study.user_attrs.get("settings", wanted) != wanted:
+        raise ValueError(f"{out} holds a search with other settings: give another folder")
+    study.set_user_attr("settings", wanted)
+    return study
+
+
+def _line(trial: Any) -> dict[str, Any]:
+    return {"number": trial.number, **trial.params, "selection_loss": trial.value}
