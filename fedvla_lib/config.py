@@ -33,7 +33,7 @@ class Config:
     min_replies: int = 1  # good training replies a round needs, else the run stops
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian or scaffold
     server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
-    server_momentum: float = 0.9  # fedavgm: share of the last server step that goes on
+    server_momentum: float = 0.5  # fedavgm: share of the last server step that goes on; at 0.9 steps grow tenfold
     personal: str = ""  # parts of the model that stay with each client, comma separated: projections, expert layer N
     exchange: str = "float32"  # bits that travel: float32, float16, or int8 (float16 on the way down)
     proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model

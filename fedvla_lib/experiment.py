@@ -26,7 +26,7 @@ import re
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ class Plan:
     """What an experiment file asks for."""
 
     cells: list[Cell]
-    rollout_seeds: list[int] = field(default_factory=list)
+    rollout_seeds: list[int]
 
 
 def read_plan(file: Path) -> Plan:
