@@ -4,7 +4,7 @@
 
     profile = "laptop"          # settings that no cell names
     seeds = [0, 1, 2]           # a seed fixes the partition, the clients drawn, batches and noise
-    rollouts = 50               # attempts at each task, for each cell
+    rollouts = 50               # attempts at each task for each cell; for kind "clients", of each client
     first_rollout_seed = 2_000_000
 
     [settings]                  # of every cell
@@ -14,7 +14,7 @@
     partition = "task"
 
     [arms.fedavg]               # a kind of training, and settings of its own
-    kind = "federated"          # base, federated, centralized or local-only
+    kind = "federated"          # or base, centralized, local-only; clients: what each ends with, on its own tasks
 
     [[only]]                    # if there are any: cells that match none of them are left out
     arm = "fedavg"
@@ -30,6 +30,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from fedvla_lib import arms, clients, data, run_folder
@@ -38,7 +39,7 @@ from fedvla_lib.evaluate import evaluate, rollout_seeds
 from fedvla_lib.lab import labs
 from fedvla_lib.model import Bundle, PolicyActor
 
-KINDS = ("base", "federated", "centralized", "local-only")
+KINDS = ("base", "federated", "centralized", "local-only", "clients")
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
 NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
 # A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
@@ -117,13 +118,26 @@ def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print) -> None:
         began = time.perf_counter()
         result = measure(cell, plan.rollout_seeds)
         run_folder.write_atomically(out / f"{cell.name}.json", (json.dumps(result) + "\n").encode())  # on one line
-        rate = sum(result["rollouts"]["success"]) / len(plan.rollout_seeds) / len(task_names(cell.config))
+        rate = sum(result["rollouts"]["success"]) / len(result["rollouts"]["success"])
         say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {time.perf_counter() - began:.0f} s")
 
 
 def measure(cell: Cell, seeds: list[int]) -> dict[str, Any]:
     """Train a cell's model, or find it in the cache, and return what is known of it and of its rollouts."""
     config = with_recording(cell.config)
+    found = _of_clients(config, len(seeds)) if cell.kind == "clients" else _of_model(cell, config, seeds)
+    rows = found.pop("rows")
+    steps = {"base": 0, "local-only": arms.steps_per_client(config)}.get(cell.kind, arms.total_steps(config))
+    return {
+        "arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "seed": cell.seed,
+        "config": asdict(cell.config), "gradient_steps": steps, "samples": steps * config.batch_size, **found,
+        "stamp": run_folder.first_stamp(cell.config, cell.kind) | {"status": "completed"},
+        "rollouts": {key: [row[key] for row in rows] for key in ("task", "lab", "seed", "success", "steps")},
+    }  # fmt: skip
+
+
+def _of_model(cell: Cell, config: Config, seeds: list[int]) -> dict[str, Any]:
+    """Measure the one model that comes out of a training, on all tasks."""
     began = time.perf_counter()
     bundle, travelled = _train(cell, config)
     trained = time.perf_counter()
@@ -132,14 +146,27 @@ def measure(cell: Cell, seeds: list[int]) -> dict[str, Any]:
     where = labs(config.num_labs, config.seed)
     actor = PolicyActor(bundle, config.seed)
     rows = evaluate(actor, task_names(config), seeds, image_size=config.image_size, labs=where, progress=False)
-    steps = {"base": 0, "local-only": arms.steps_per_client(config)}.get(cell.kind, arms.total_steps(config))
     return {
-        "arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "seed": cell.seed,
-        "config": asdict(cell.config), "gradient_steps": steps, "samples": steps * config.batch_size,
-        "held_out_frames": frames, "held_out": held_out, "bytes": travelled,
+        "held_out_frames": frames, "held_out": held_out, "bytes": travelled, "rows": rows,
         "train_s": trained - began, "evaluate_s": time.perf_counter() - trained,
-        "stamp": run_folder.first_stamp(cell.config, cell.kind) | {"status": "completed"},
-        "rollouts": {key: [row[key] for row in rows] for key in ("task", "lab", "seed", "success", "steps")},
+    }  # fmt: skip
+
+
+def _of_clients(config: Config, rollouts: int) -> dict[str, Any]:
+    """Measure what each client ends with, its own parts included, on its own tasks and held-out episodes."""
+    began = time.perf_counter()
+    run = arms.federated(replace(config, fraction_evaluate=1.0, client_rollouts=rollouts), progress=False)
+    events = {kind: run_folder.read_metrics(run, kind) for kind in ("rollout", "evaluate", "replies")}
+    own = {kind: of_kind[of_kind.who != run_folder.GLOBAL] for kind, of_kind in events.items()}
+    last = own["evaluate"][own["evaluate"]["round"] == config.num_server_rounds]
+    last = last[last.num_examples > 0]
+    training = events["replies"][events["replies"]["to"] == "train"]
+    return {
+        "held_out_frames": int(last.num_examples.sum()),
+        "held_out": {"loss": float(np.average(last.loss, weights=last.num_examples))},
+        "bytes": int(training.sent_bytes.sum() + training.received_bytes.sum()),
+        "rows": own["rollout"].to_dict("records"),
+        "train_s": time.perf_counter() - began, "evaluate_s": 0.0,
     }  # fmt: skip
 
 

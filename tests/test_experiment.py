@@ -85,18 +85,21 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     lines = ["profile = 'tiny'", "seeds = [0]", "rollouts = 2", "[settings]"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     lines += ["[partitions.mixed]", "[arms.start]", "kind = 'base'", "[arms.averaged]", "[arms.pooled]",
-              "kind = 'centralized'", "[arms.alone]", "kind = 'local-only'"]  # fmt: skip
+              "kind = 'centralized'", "[arms.alone]", "kind = 'local-only'", "[arms.each]", "kind = 'clients'",
+              "personal = 'projections'"]  # fmt: skip
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
     plan = experiment.read_plan(file)
     experiment.run_plan(experiment.Plan(plan.cells[:2], plan.rollout_seeds), out)
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert main(["experiment", str(file), "--out", str(out)]) == 0
-    assert "4 cells, 2 of them in" in capsys.readouterr().out
+    assert "5 cells, 2 of them in" in capsys.readouterr().out
     assert all((out / name).stat().st_mtime_ns == time for name, time in before.items())
 
     rows = experiment.read_results(out)
+    each, rows = rows[rows.arm == "each"], rows[rows.arm != "each"]
     assert set(rows.arm) == {"start", "averaged", "pooled", "alone"} and len(rows) == 4 * 2 * 2
+    assert len(each) == 2 * 2 and each.loss.notna().all()  # of every client its own attempts
     pairs = rows.groupby("arm")[["task", "seed"]].apply(lambda part: sorted(map(tuple, part.values)))
     assert all(pair == pairs.iloc[0] for pair in pairs)  # every arm made the same attempts
     steps = rows.groupby("arm").gradient_steps.first()
