@@ -299,11 +299,17 @@ def _benchmark_tables(files: list[Path]) -> str:
     parts = []
     for path in filter(Path.is_file, files):
         result = json.loads(path.read_text(encoding="utf-8"))
-        rows = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in result["rows"]]
+        rows = [[_number(value) for value in row.values()] for row in result["rows"]]
         title = TITLES.get(path.stem, path.stem.replace("_", " "))
         where = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
         parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{_table(list(result['rows'][0]), rows)}")
     return "\n".join(parts)
+
+
+def _number(value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _rate(row: dict, name: str) -> list[str]:
