@@ -13,7 +13,7 @@ from fedvla_lib import clients, wire
 from fedvla_lib.config import from_run_config
 from fedvla_lib.corrections import ControlVariates, Correction, Parameters, Proximal
 from fedvla_lib.model import Bundle
-from fedvla_lib.params import Arrays, digest, load_arrays, shapes_of, trainable, trainable_arrays
+from fedvla_lib.params import Arrays, digest, load_arrays, shapes_of, trainable_arrays
 from fedvla_lib.quantise import DOWNWARD, with_feedback
 
 # What a client keeps in its state from round to round, beside SCAFFOLD's control variate.
@@ -40,11 +40,12 @@ def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
     def train(message: Message, context: Context) -> Message:
         client = _client(context, tools)
         bundle = _policy(client, message, tools, context)
-        order, start = message.content[wire.CONFIG], _shared(bundle)
-        correction = correction_for(message, context, {name: trainable(bundle.policy)[name] for name in start})
+        order, exchange = message.content[wire.CONFIG], client.config.exchange
+        start = {} if exchange == "float32" else bundle.shared_arrays()  # needed only to send the change
+        correction = correction_for(message, context, bundle.shared())
         moments = _recall(context, MOMENTS) if client.config.keep_optimizer else None
         result = client.train(bundle, order[wire.ROUND], correction, moments)
-        arrays = _outgoing(_shared(bundle), start, client.config.exchange, context)
+        arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
         metrics = {
             wire.EXAMPLES: result.num_examples,
             "loss": sum(result.losses) / len(result.losses),
@@ -95,7 +96,7 @@ def correction_for(message: Message, context: Context, parameters: Parameters) -
         ParameterError: the control variates that came are not usable.
     """
     if wire.CONTROL in message.content:
-        shapes = {name: tuple(parameter.shape) for name, parameter in parameters.items()}
+        shapes = shapes_of(parameters)
         server = wire.checked_arrays(message.content, wire.CONFIG, shapes, wire.CONTROL, also=(wire.ARRAYS,))
         return ControlVariates(server, _recall(context, wire.CONTROL))
     mu = message.content[wire.CONFIG].get(wire.PROXIMAL_MU, 0.0)
@@ -130,15 +131,10 @@ def _policy(client: clients.Client, message: Message, tools: clients.Tools, cont
     """Return the policy holding the global arrays of the message, once they have passed every check, and its own."""
     bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
     exchange = DOWNWARD[client.config.exchange]
-    shapes = shapes_of(_shared(bundle))
+    shapes = shapes_of(bundle.shared())
     arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,), exchange=exchange)
     load_arrays(bundle.policy, arrays | (_recall(context, OWN) or bundle.own))
     return bundle
-
-
-def _shared(bundle: Bundle) -> Arrays:
-    """What trains and is everybody's."""
-    return {name: array for name, array in trainable_arrays(bundle.policy).items() if name not in bundle.own}
 
 
 def _rollouts(client: clients.Client, bundle: Bundle, round_number: int) -> ConfigRecord:

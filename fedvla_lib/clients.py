@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fedvla_lib import data, model, partition, prefix, train
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, task_names
 from fedvla_lib.corrections import Correction
 from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.lab import REFERENCE, Lab, labs
@@ -177,6 +177,16 @@ def validate(
         return 0, {}
     metrics = train.validate(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
     return sum(len(batch["task"]) for batch in batches), metrics
+
+
+def roll_out(
+    bundle: model.Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False
+) -> list[dict[str, Any]]:
+    """Let one model act on all tasks of the mix, in the laboratories of the run, and return a row for each attempt."""
+    return evaluate(
+        model.PolicyActor(bundle, config.seed), task_names(config), seeds, image_size=config.image_size,
+        labs=labs(config.num_labs, config.seed), videos_dir=videos_dir, progress=progress,
+    )  # fmt: skip
 
 
 def held_out_batches(store: data.FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:

@@ -14,7 +14,8 @@
     partition = "task"
 
     [arms.fedavg]               # a kind of training, and settings of its own
-    kind = "federated"          # or base, centralized, local-only; clients: what each ends with, on its own tasks
+    kind = "federated"          # or base, centralized, local-only (of `client`, default 0); or clients: what each
+                                # ends with, on its own tasks
 
     [[only]]                    # if there are any: cells that match none of them are left out
     arm = "fedavg"
@@ -34,14 +35,14 @@ import numpy as np
 import pandas as pd
 
 from fedvla_lib import arms, clients, data, run_folder
-from fedvla_lib.config import Config, from_profile, task_names
-from fedvla_lib.evaluate import evaluate, rollout_seeds
-from fedvla_lib.lab import labs
-from fedvla_lib.model import Bundle, PolicyActor
+from fedvla_lib.config import Config, from_profile
+from fedvla_lib.evaluate import rollout_seeds
+from fedvla_lib.model import Bundle
 
 KINDS = ("base", "federated", "centralized", "local-only", "clients")
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
 NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
+RULES = ("arm", "partition", "seed", "kind")  # what a rule under [[only]] may name
 # A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
 QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_rollouts": 0, "checkpoint_every": 0}
 
@@ -86,8 +87,29 @@ def read_plan(file: Path) -> Plan:
             raise ValueError(f"{file} lacks {name!r}: give one of each of arms, partitions, seeds and rollouts")
     if unknown := sorted(set(told) - NAMES):
         raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
+    _check_types(told, Path(file))
     cells = [cell for cell in _cells(told, Path(file)) if _wanted(cell, told.get("only", []))]
     return Plan(cells, rollout_seeds(told["rollouts"], first=told.get("first_rollout_seed", 2_000_000)))
+
+
+def _check_types(told: dict[str, Any], file: Path) -> None:
+    """Raise ValueError where a name holds another kind of thing than the example above, or a rule names no property."""
+    seeds = told["seeds"]
+    usable = {
+        "seeds": (isinstance(seeds, list) and all(type(seed) is int for seed in seeds), "a list of whole numbers"),
+        "rollouts": (type(told["rollouts"]) is int and told["rollouts"] > 0, "a number above 0"),
+        "first_rollout_seed": (type(told.get("first_rollout_seed", 0)) is int, "a whole number"),
+    }
+    for name in ("arms", "partitions"):
+        tables = told[name]
+        usable[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
+    usable["settings"] = (isinstance(told.get("settings", {}), dict), "a table")
+    for name, (fits, wanted) in usable.items():
+        if not fits:
+            raise ValueError(f"{file}: {name}={told[name]!r} is not usable: give {wanted}")
+    for rule in told.get("only", []):
+        if unknown := sorted(set(rule) - set(RULES)):
+            raise ValueError(f"{file}: unknown name {unknown[0]!r} under [[only]]: choose from {', '.join(RULES)}")
 
 
 def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
@@ -95,13 +117,13 @@ def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
         for partition, of_partition in told["partitions"].items():
             for arm, of_arm in told["arms"].items():
                 own = dict(of_arm)
-                kind = own.pop("kind", "federated")
+                kind, client = own.pop("kind", "federated"), own.pop("client", 0)
                 if bad := [name for name in (partition, arm) if not FILE_NAME.fullmatch(name)]:
                     raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
                 if kind not in KINDS:
                     raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
                 settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings))
+                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings), client)
 
 
 def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:
@@ -143,9 +165,7 @@ def _of_model(cell: Cell, config: Config, seeds: list[int]) -> dict[str, Any]:
     trained = time.perf_counter()
     store = clients.open_frames(config)
     frames, held_out = clients.validate(bundle, store, clients.held_out_episodes(store, config), config)
-    where = labs(config.num_labs, config.seed)
-    actor = PolicyActor(bundle, config.seed)
-    rows = evaluate(actor, task_names(config), seeds, image_size=config.image_size, labs=where, progress=False)
+    rows = clients.roll_out(bundle, config, seeds)
     return {
         "held_out_frames": frames, "held_out": held_out, "bytes": travelled, "rows": rows,
         "train_s": trained - began, "evaluate_s": time.perf_counter() - trained,

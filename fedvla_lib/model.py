@@ -32,7 +32,7 @@ from safetensors import safe_open
 from fedvla_lib.config import Config, cache_dir, granted_threads, personal_parts
 from fedvla_lib.lora import add_adapters, merged
 from fedvla_lib.nano import ensure_nano
-from fedvla_lib.params import Arrays, layer_of, trainable_arrays
+from fedvla_lib.params import Arrays, layer_of, trainable, trainable_arrays
 from fedvla_lib.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, Observation, image_key
 
 POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
@@ -53,6 +53,14 @@ class Bundle:
     preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
     postprocess: Any  # normalised actions -> degrees and gripper 0-100
     own: Arrays = field(default_factory=dict)  # what is personal, as it was when the policy was loaded
+
+    def shared(self) -> dict[str, torch.nn.Parameter]:
+        """Return the live parameters that train and belong to everybody, by name."""
+        return {name: p for name, p in trainable(self.policy).items() if name not in self.own}
+
+    def shared_arrays(self) -> Arrays:
+        """Return copies of what travels, float32, by name."""
+        return {name: array for name, array in trainable_arrays(self.policy).items() if name not in self.own}
 
 
 def load_policy(config: Config, stats: Stats | None = None) -> Bundle:

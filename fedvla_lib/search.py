@@ -15,11 +15,10 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from fedvla_lib import arms, clients, run_folder
-from fedvla_lib.config import Config, check, task_names
-from fedvla_lib.evaluate import evaluate, rollout_seeds
+from fedvla_lib.config import Config, check
+from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.experiment import QUIET, with_recording
-from fedvla_lib.lab import labs
-from fedvla_lib.model import Bundle, PolicyActor
+from fedvla_lib.model import Bundle
 from fedvla_lib.roster import draw_size
 
 ROLLOUTS_FROM = 3_000_000  # apart from the seeds of chapters and experiments
@@ -37,11 +36,16 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
         out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
 
     Raises:
-        ValueError: fewer than one trial, or `out` holds a search with other settings.
+        ValueError: fewer than one trial or two validation episodes, or `out` holds a search with other settings.
     """
     if trials < 1:
         raise ValueError(f"trials={trials} is not usable: give a number above 0")
     config, out = with_recording(replace(config, **QUIET, validate_every=10**6)), Path(out)
+    if (count := len(clients.held_out_episodes(clients.open_frames(config), config))) < 2:
+        raise ValueError(
+            f"val-fraction={config.val_fraction} leaves {count} validation episodes: a search needs 2 or more, half to "
+            "choose by and half to report on"
+        )
     study = _open(config, out)
     todo = trials - len(study.get_trials(states=[optuna.trial.TrialState.COMPLETE]))
     study.optimize(lambda trial: _selection_loss(suggest(trial, config)), n_trials=max(0, todo), show_progress_bar=True)
@@ -72,9 +76,7 @@ def suggest(trial: Any, config: Config) -> Config:
 def report(config: Config, rollouts: int) -> dict[str, Any]:
     """Measure settings on what did not choose them: the other validation episodes, and rollouts."""
     bundle = arms.federated_policy(config)
-    actor, where = PolicyActor(bundle, config.seed), labs(config.num_labs, config.seed)
-    seeds = rollout_seeds(rollouts, first=ROLLOUTS_FROM)
-    rows = evaluate(actor, task_names(config), seeds, image_size=config.image_size, labs=where, progress=False)
+    rows = clients.roll_out(bundle, config, rollout_seeds(rollouts, first=ROLLOUTS_FROM))
     return {
         "loss": _loss(bundle, config, 1), "gradient_steps": arms.total_steps(config),
         "n": len(rows), "successes": sum(row["success"] for row in rows),

@@ -12,9 +12,8 @@ from flwr.serverapp import Grid, ServerApp
 
 from fedvla_lib import clients, data, model, roster, run_folder, strategies, wire
 from fedvla_lib.config import Config, from_run_config, task_names
-from fedvla_lib.evaluate import evaluate, rollout_seeds, success_rate
-from fedvla_lib.lab import labs
-from fedvla_lib.params import load_arrays, shapes_of, trainable_arrays
+from fedvla_lib.evaluate import rollout_seeds, success_rate
+from fedvla_lib.params import load_arrays, shapes_of
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.tasks import check_tasks
 from fedvla_lib.wire import Rollouts
@@ -48,7 +47,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
     store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
     members, weights, stats = _introduce(grid, config, run)
     bundle = model.load_policy(config, stats)
-    arrays = {name: array for name, array in trainable_arrays(bundle.policy).items() if name not in bundle.own}
+    arrays = bundle.shared_arrays()
     strategy = strategies.build(
         config,
         weights,
@@ -105,15 +104,9 @@ class Judge:
         config = self.config
         if not config.eval_rollouts or not clients.rolls_out(config, round_number):
             return {}
-        rows = evaluate(
-            model.PolicyActor(self.bundle, config.seed),
-            task_names(config),
-            rollout_seeds(config.eval_rollouts),
-            image_size=config.image_size,
-            labs=labs(config.num_labs, config.seed),
-            videos_dir=self.run.videos_dir(round_number, GLOBAL),
-            progress=self.progress,
-        )
+        videos_dir = self.run.videos_dir(round_number, GLOBAL)
+        seeds = rollout_seeds(config.eval_rollouts)
+        rows = clients.roll_out(self.bundle, config, seeds, videos_dir, self.progress)
         _log_rollouts(self.run, round_number, GLOBAL, rows)
         by_task = {task: [row for row in rows if row["task"] == task] for task in task_names(config)}
         return {"success_rate": success_rate(rows)} | {

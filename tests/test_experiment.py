@@ -65,6 +65,9 @@ def test_cells_come_seed_by_seed_and_only_those_wanted(file):
         (("rollouts = 2", "rollouts = 2\nattempts = 3"), "'attempts'"),
         (('kind = "centralized"', 'kind = "central"'), "'central'.*local-only"),
         (("num_clients = 2", "clients = 2"), "'clients'"),
+        (("seeds = [0, 1]", "seeds = 3"), "seeds=3.*list of whole numbers"),
+        (("rollouts = 2", "rollouts = 'two'"), "rollouts='two'.*above 0"),
+        (('arm = "averaged"', 'strategy = "averaged"'), "'strategy' under.*arm"),
         (("[arms.pooled]", "[arms.'../pooled']"), "'../pooled'"),
     ],
 )

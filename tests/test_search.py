@@ -48,3 +48,12 @@ def test_the_halves_of_the_validation_episodes_share_none(store):
     config = from_profile("tiny", val_fraction=0.5)
     held_out = clients.held_out_episodes(store, config)
     assert not set(held_out[0::2]) & set(held_out[1::2]) and len(held_out) >= 2
+
+
+@pytest.mark.integration
+def test_a_search_without_validation_episodes_is_refused(recording, tmp_path, capsys):
+    command = ["search", "--profile", "tiny", "--data", str(recording), "--val-fraction", "0"]
+    assert main([*command, "--search-out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "val-fraction=0" in said and len(said.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
