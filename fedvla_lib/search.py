@@ -13,16 +13,19 @@ from typing import Any
 import optuna
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
 
 from fedvla_lib import arms, clients, run_folder
 from fedvla_lib.config import Config, check
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.experiment import QUIET, with_recording
 from fedvla_lib.model import Bundle
-from fedvla_lib.roster import draw_size
+from fedvla_lib.roster import TooFewReplies, draw_size
 
 ROLLOUTS_FROM = 3_000_000  # apart from the seeds of chapters and experiments
 LOCAL_STEPS = (1, 2, 5, 10, 20)
+# A client whose loss is not finite raises, and the server gives up when too few replies can be used.
+DIVERGED = (FloatingPointError, TooFewReplies)
 SHARES = (0.1, 0.2, 0.4, 1.0)
 
 
@@ -35,25 +38,35 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
         rollouts: attempts at each task when the winner is measured.
         out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
 
+    A trial that diverges counts as one of them, with no loss.
+
     Raises:
-        ValueError: fewer than one trial or two validation episodes, or `out` holds a search with other settings.
+        ValueError: fewer than one trial or two validation episodes, `out` holds a search with other settings, or every
+            trial diverged.
     """
     if trials < 1:
         raise ValueError(f"trials={trials} is not usable: give a number above 0")
-    config, out = with_recording(replace(config, **QUIET, validate_every=10**6)), Path(out)
+    given = replace(config, **QUIET, validate_every=10**6)
+    config, out = with_recording(given), Path(out)
     if (count := len(clients.held_out_episodes(clients.open_frames(config), config))) < 2:
         raise ValueError(
             f"val-fraction={config.val_fraction} leaves {count} validation episodes: a search needs 2 or more, half to "
             "choose by and half to report on"
         )
     study = _open(config, out)
-    todo = trials - len(study.get_trials(states=[optuna.trial.TrialState.COMPLETE]))
-    study.optimize(lambda trial: _selection_loss(suggest(trial, config)), n_trials=max(0, todo), show_progress_bar=True)
-    budget = arms.total_steps(config)
+    todo = trials - len(study.get_trials(states=[TrialState.COMPLETE, TrialState.FAIL]))
+    study.optimize(
+        lambda trial: _selection_loss(suggest(trial, config)),
+        n_trials=max(0, todo), show_progress_bar=True, catch=DIVERGED,
+    )  # fmt: skip
+    if not study.get_trials(states=[TrialState.COMPLETE]):
+        raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
     found = {
-        "budget": budget, "trials": [_line(trial) for trial in study.trials if trial.value is not None],
+        "budget": arms.total_steps(config),
+        "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],
         "winner": study.best_params, "selection_loss": study.best_value,
         "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
+        "config": asdict(given), "stamp": run_folder.first_stamp(given, "search") | {"status": "completed"},
     }  # fmt: skip
     run_folder.write_json(out / "search.json", found)
     return found

@@ -1,6 +1,7 @@
 """The search spends what it says, goes on where it stopped, and judges on what did not choose."""
 
 import json
+from dataclasses import replace
 
 import optuna
 import pytest
@@ -57,3 +58,23 @@ def test_a_search_without_validation_episodes_is_refused(recording, tmp_path, ca
     said = capsys.readouterr().err
     assert "val-fraction=0" in said and len(said.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.integration
+def test_a_trial_that_diverges_counts_and_does_not_end_the_search(recording, tmp_path, monkeypatch, capsys):
+    draw = search.suggest
+
+    def ruinous(trial, config):
+        drawn = draw(trial, config)
+        return replace(drawn, lr=1e30, local_steps=2, num_server_rounds=1) if trial.number in ruined else drawn
+
+    monkeypatch.setattr(search, "suggest", ruinous)
+    command = ["search", "--profile", "tiny", "--data", str(recording), "--tasks", "lift,push", "--num-clients", "2"]
+    command += ["--val-fraction", "0.5", "--rollouts", "1", "--search-out", str(tmp_path)]
+    ruined = {0}
+    assert main([*command, "--trials", "1"]) == 2
+    assert "all 1 trials" in capsys.readouterr().err
+    assert main([*command, "--trials", "2"]) == 0
+    found = json.loads((tmp_path / "search.json").read_text())
+    assert [trial["selection_loss"] is None for trial in found["trials"]] == [True, False]
+    assert found["config"]["data"] == str(recording) and found["stamp"]["status"] == "completed"
