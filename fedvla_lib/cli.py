@@ -7,7 +7,9 @@ Heavy packages are imported inside the commands, so that help and settings answe
 import argparse
 import inspect
 import json
+import os
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -19,6 +21,7 @@ from fedvla_lib.config import PROFILES, Config, Recipe, from_profile, task_names
 from fedvla_lib.spec import CAMERAS, image_key
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
+DOWN = 3  # as service managers report a service that is not running
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 
@@ -56,6 +59,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_settings(_command(commands, "config", config, "print the settings as TOML for flwr run --run-config"))
     _add_train(commands)
     _add_run(commands)
+    _add_deploy(commands)
+    _add_superlink(commands)
+    _add_credentials(commands)
     _add_evaluate(commands)
     _add_experiment(commands)
     _add_search(commands)
@@ -112,7 +118,36 @@ def _add_run(commands: Any) -> None:
     parser = _command(commands, "run", run, "run a federation", "the rounds that ended stay in the run folder")
     text = "inline: in this process, in a fixed order; simulation: Flower's runtime, several processes"
     parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
+    text = "go on with this interrupted run, with its own settings"
+    parser.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help=text)
     _add_settings(parser)
+
+
+def _add_deploy(commands: Any) -> None:
+    kept = "every process is stopped; the rounds that ended stay in the run folder"
+    text = "run a federation on a SuperLink and SuperNodes of this machine, each a process of its own"
+    parser = _command(commands, "deploy", deploy, text, kept)
+    parser.add_argument("--clients", type=int, dest="num_clients", metavar="N", help="the same as --num-clients")
+    parser.add_argument("--tls", action="store_true", help="encrypt, with certificates made for the occasion")
+    parser.add_argument("--auth", action="store_true", help="let in only nodes whose key is known; needs --tls")
+    text = "a client's own data set, in the order of clients; repeat for each (default: parts of --data)"
+    parser.add_argument("--node-data", action="append", type=Path, metavar="DIR", help=text)
+    _add_settings(parser)
+
+
+def _add_superlink(commands: Any) -> None:
+    text = "start, stop or look at the SuperLink that flwr run . local-simulation talks to"
+    parser = _command(commands, "superlink", standing_superlink, text, "nothing was started")
+    parser.add_argument("action", choices=("up", "down", "status"), help="status exits with 3 if it is down")
+
+
+def _add_credentials(commands: Any) -> None:
+    text = "make certificates and node keys for a deployment on several hosts"
+    parser = _command(commands, "credentials", make_credentials, text)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the files")
+    text = "name or address under which nodes reach the server; repeat for several"
+    parser.add_argument("--host", action="append", required=True, metavar="HOST", help=text)
+    parser.add_argument("--nodes", type=int, required=True, metavar="N", help="nodes that get a key")
 
 
 def _add_experiment(commands: Any) -> None:
@@ -152,6 +187,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("settings", "every setting of a run; the default is the profile's")
     meaning = setting_texts()
     for field in fields(Config):
+        if field.name == "resume":  # only where there is something to go on with
+            continue
         flag, text = "--" + field.name.replace("_", "-"), meaning[field.name].replace("%", "%%")
         typed = {"type": field.type, "metavar": field.type.__name__.upper()}
         kind = {"action": argparse.BooleanOptionalAction} if field.type is bool else typed
@@ -165,7 +202,7 @@ def setting_texts(settings_class: type = Config) -> dict[str, str]:
 
 def settings(options: argparse.Namespace) -> Config:
     """Return the profile's settings with the given flags on top."""
-    names = {field.name for field in fields(Config)}
+    names = {field.name for field in fields(Config)} - {"resume"}
     return from_profile(options.profile, **{name: value for name, value in vars(options).items() if name in names})
 
 
@@ -280,10 +317,64 @@ def _learner(chosen: Config, client: int | None) -> Any:
 
 def run(options: argparse.Namespace) -> None:
     """Run a federation and print what was measured of the global model, round by round."""
+    chosen = _to_resume(options) if options.resume else settings(options)
+    _print_rounds(_engine(options.engine)(chosen))
+
+
+def _to_resume(options: argparse.Namespace) -> Config:
+    """Return the settings of an interrupted run; with it only what does not change the result may be given."""
+    from fedvla_lib.run_folder import read_config
+
+    names = {field.name for field in fields(Config)} - {"resume", "num_threads"}
+    if given := sorted(names & set(vars(options))):
+        raise ValueError(f"--{given[0].replace('_', '-')} cannot be given with --resume: a run keeps its settings")
+    if not (options.resume / "config.json").is_file():
+        raise ValueError(f"--resume {options.resume}: no run folder there, it has no config.json")
+    threads = {"num_threads": options.num_threads} if "num_threads" in vars(options) else {}
+    return replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
+
+
+def deploy(options: argparse.Namespace) -> None:
+    """Run a federation on processes of this machine and print what was measured of the global model."""
+    from fedvla_lib.deploy import run_deployed
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was started is stopped here too
+    data = options.node_data or []
+    _print_rounds(run_deployed(settings(options), tls=options.tls, auth=options.auth, data=data))
+
+
+def standing_superlink(options: argparse.Namespace) -> int:
+    """Start or stop the SuperLink of the project's connection file, or say whether it is up."""
+    from fedvla_lib import standing
+
+    if not os.environ.get("FLWR_HOME"):
+        raise ValueError("FLWR_HOME is not set: `. flower/env.sh` first, so that Flower settings of your own stay")
+    home = Path(os.environ["FLWR_HOME"])
+    if options.action == "status":
+        is_up, words = standing.status(home)
+        print(words)
+        return 0 if is_up else DOWN
+    print({"up": standing.up, "down": standing.down}[options.action](home))
+    return 0
+
+
+def make_credentials(options: argparse.Namespace) -> None:
+    """Write an authority's and a server's certificate and a key for each node, and say who gets which."""
+    from fedvla_lib import credentials
+
+    _require_positive("--nodes", options.nodes)
+    if options.out.exists():
+        raise ValueError(f"--out {options.out} exists: give a new folder, so that no key is overwritten")
+    files = credentials.make_server(options.out / "server", options.host)
+    keys = [credentials.make_node_key(options.out / "nodes", f"node_{k}") for k in range(options.nodes)]
+    print(f"for the server only: {files.key}\nfor the server: {files.certificate}\nfor all: {files.authority}")
+    for k, key in enumerate(keys):
+        print(f"for node {k} only: {key.private}; its public half, to be registered: {key.public}")
+
+
+def _print_rounds(folder: Path) -> None:
     from fedvla_lib.run_folder import read_metrics
 
-    chosen = settings(options)
-    folder = _engine(options.engine)(chosen)
     rounds = read_metrics(folder, kind="evaluate")
     _print_table(rounds[rounds.who == "global"].drop(columns=["who", "kind", "time"]))
     print(folder)

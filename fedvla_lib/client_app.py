@@ -83,7 +83,8 @@ def _client(context: Context, tools: clients.Tools) -> clients.Client:
     config = from_run_config(context.run_config)
     if wire.PARTITION not in context.node_config:
         raise ValueError(f"this node has no {wire.PARTITION}: start it with --node-config 'partition-id=K'")
-    return clients.open_client(config, int(context.node_config[wire.PARTITION]), tools)
+    own_data = str(context.node_config.get(wire.DATA, ""))
+    return clients.open_client(config, int(context.node_config[wire.PARTITION]), tools, own_data)
 
 
 def correction_for(message: Message, context: Context, parameters: Parameters) -> Correction | None:

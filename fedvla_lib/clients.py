@@ -5,7 +5,7 @@ touches only the episodes of its own part.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,8 +132,11 @@ class Client:
         return rows
 
 
-def open_client(config: Config, partition_id: int, tools: Tools = TOOLS) -> Client:
-    """Return client `partition_id` with its episodes.
+def open_client(config: Config, partition_id: int, tools: Tools = TOOLS, own_data: str = "") -> Client:
+    """Return client `partition_id` with its episodes: a part of the run's data set, or all of one that is its own.
+
+    Args:
+        own_data: the client's own data set, a folder or hub id; without one it takes its part of ``config.data``.
 
     Raises:
         ValueError: there is no such partition; the message says what to change.
@@ -143,6 +146,10 @@ def open_client(config: Config, partition_id: int, tools: Tools = TOOLS) -> Clie
             f"partition-id={partition_id} is not one of num-clients={config.num_clients} partitions (0 to "
             f"{config.num_clients - 1}): start as many SuperNodes as num-clients says"
         )
+    if own_data:
+        config = replace(config, data=own_data)
+        store = tools.open_frames(config)
+        return Client(config, partition_id, store, Share(*data.split(store, config.val_fraction, config.seed)))
     store = tools.open_frames(config)
     return Client(config, partition_id, store, shares(store, config)[partition_id])
 
@@ -217,6 +224,14 @@ def labs_of(store: data.FrameStore, episode_ids: Sequence[int], config: Config) 
 def client_seed(seed: int, partition_id: int) -> int:
     """Return the seed of a client's own random stream; streams of different clients and runs do not overlap."""
     return int(np.random.SeedSequence([seed, partition_id]).generate_state(1)[0])
+
+
+def keeps(config: Config) -> dict[str, bool]:
+    """Whether clients keep something from round to round, by the setting that makes them."""
+    return {
+        f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
+        f"exchange={config.exchange}": config.exchange != "float32", "personal": bool(config.personal),
+    }  # fmt: skip
 
 
 def is_validated(config: Config, round_number: int) -> bool:

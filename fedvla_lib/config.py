@@ -31,9 +31,11 @@ class Config:
     fraction_train: float = 0.4  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
-    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian or scaffold
+    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian, krum or scaffold
     server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
     server_momentum: float = 0.5  # fedavgm: share of the last server step that goes on; at 0.9 steps grow tenfold
+    clip_norm: float = 0.0  # longest movement of a client in a round that counts whole; 0 counts all whole
+    num_malicious: int = 1  # krum: clients drawn for a round that may send anything
     personal: str = ""  # parts of the model that stay with each client, comma separated: projections, expert layer N
     exchange: str = "float32"  # bits that travel: float32, float16, or int8 (float16 on the way down)
     proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model
@@ -64,6 +66,7 @@ class Config:
     device: str = "cpu"  # torch device: cpu, cuda or mps
     num_threads: int = 0  # torch threads; 0 takes the cores granted to this process
     out: str = "outputs"  # where run folders are made
+    resume: str = ""  # run folder of an interrupted run to go on with; empty starts a new one
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ PROFILES: dict[str, dict[str, Any]] = {
 }
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
 EXCHANGES = ("float32", "float16", "int8")
-STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "scaffold")
+STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "krum", "scaffold")
 
 
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
@@ -193,7 +196,7 @@ def check(config: Config) -> Config:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
     countable = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
-        "server_lr", "proximal_mu", "lora_rank",
+        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious",
     )  # fmt: skip
     for name in countable:
         _require(getattr(config, name) >= 0, config, name, "0 or more")

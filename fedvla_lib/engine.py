@@ -8,7 +8,7 @@ import copy
 import functools
 import logging
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,8 +20,9 @@ from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 from tqdm.auto import tqdm
 
-from fedvla_lib import client_app, clients, server_app
+from fedvla_lib import client_app, clients, server_app, wire
 from fedvla_lib.config import Config, check, to_run_config
+from fedvla_lib.params import Arrays
 
 logger = logging.getLogger(__name__)
 RUN_ID = 1
@@ -29,12 +30,18 @@ FIRST_NODE_ID = SUPERLINK_NODE_ID + 1
 
 
 def run_inline(
-    config: Config, *, clients_app: ClientApp | None = None, progress: bool = True, raise_errors: bool = False
+    config: Config,
+    *,
+    clients_app: ClientApp | None = None,
+    data: Sequence[Path] = (),
+    progress: bool = True,
+    raise_errors: bool = False,
 ) -> Path:
     """Run a federation in this process and return its run folder; the same settings give the same bits.
 
     Args:
         clients_app: the ClientApp to call; default this library's, with frames and policy opened once for all clients.
+        data: a data set for each client; without, each takes its part of ``config.data``.
         progress: show a bar over the clients of each round.
         raise_errors: let a client's exception surface (for debugging) instead of rejecting its reply.
 
@@ -48,8 +55,8 @@ def run_inline(
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
     claim_identity()
     with _quiet_flower():
-        grid = InlineGrid(app, config.num_clients, run_config, progress=progress, raise_errors=raise_errors)
-        server_app.build(tools, engine="inline", progress=progress)(grid, context)
+        grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
+        server_app.build(tools, engine="inline", progress=progress, states=grid)(grid, context)
     return Path(context.state["run"]["folder"])
 
 
@@ -65,6 +72,7 @@ class InlineGrid(Grid):
         app: handles the messages of all clients.
         num_clients: clients there are; client k is node ``FIRST_NODE_ID + k``, with partition-id k and its own context.
         run_config: settings of the run, as Flower passes them.
+        data: a data set for each client; none: the settings' own.
     """
 
     def __init__(
@@ -72,6 +80,7 @@ class InlineGrid(Grid):
         app: ClientApp,
         num_clients: int,
         run_config: UserConfig,
+        data: Sequence[Path] = (),
         *,
         progress: bool = False,
         raise_errors: bool = False,
@@ -82,7 +91,9 @@ class InlineGrid(Grid):
         self._sent = 0
         self._contexts = {}
         for k in range(num_clients):
-            node, node_config = FIRST_NODE_ID + k, {"partition-id": k, "num-partitions": num_clients}
+            node, node_config = FIRST_NODE_ID + k, {wire.PARTITION: k, "num-partitions": num_clients}
+            if data:
+                node_config[wire.DATA] = str(Path(data[k]).resolve())
             self._contexts[node] = Context(RUN_ID, node, node_config, RecordDict(), dict(run_config))
 
     def set_run(self, run: Run) -> None:
@@ -118,6 +129,20 @@ class InlineGrid(Grid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
         """Push and pull; there is nothing to wait for, so `timeout` has no effect."""
         return self.pull_messages(self.push_messages(messages))
+
+    def client_states(self) -> dict[str, Arrays]:
+        """Return the arrays in the clients' contexts, by node and record."""
+        return {
+            f"{node}:{name}": wire.unpack_arrays(record)
+            for node, context in self._contexts.items()
+            for name, record in context.state.array_records.items()
+        }
+
+    def restore_clients(self, states: dict[str, Arrays]) -> None:
+        """Put arrays back into the clients' contexts."""
+        for key, arrays in states.items():
+            node, name = key.split(":", 1)
+            self._contexts[int(node)].state[name] = wire.pack_arrays(arrays)
 
     def _handle(self, message: Message) -> str:
         """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class Roster:
     """Which node holds which partition."""
 
     partition_of: dict[int, int]  # node id -> partition id
+    examples_of: dict[int, int] = field(default_factory=dict)  # node id -> training frames it introduced itself with
 
     def name(self, node_id: int) -> str:
         """Return the client's name: ``client_3`` holds partition 3."""
@@ -91,7 +92,11 @@ def call(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> tupl
             values = {"to": "query", "reason": error.kind, "detail": str(error)}
             report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
     by_partition = sorted(known, key=lambda node: known[node].partition_id)
-    return Roster({node: known[node].partition_id for node in by_partition}), [known[node] for node in by_partition]
+    members = Roster(
+        {node: known[node].partition_id for node in by_partition},
+        {node: known[node].num_examples for node in by_partition},
+    )
+    return members, [known[node] for node in by_partition]
 
 
 def answered(reply: Message | None) -> Message:

@@ -64,14 +64,20 @@ class RunFolder:
 
 @contextmanager
 def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
-    """Make ``<config.out>/<YYYYmmdd_HHMMSS>/``, yield it, and stamp it with how the run ended.
+    """Make ``<config.out>/<YYYYmmdd_HHMMSS>/``, or take ``config.resume``, yield it, and stamp how the run ended.
 
     Raises:
-        ValueError: the folder cannot be written.
+        ValueError: the folder cannot be written, or what is to be resumed is no such run.
     """
-    run = RunFolder(_make_folder(Path(config.out)))
-    write_json(run.root / "config.json", asdict(config))
     stamp, began = first_stamp(config, engine), time.perf_counter()
+    if config.resume:
+        run = RunFolder(Path(config.resume))
+        _check_resumable(run.root, config)
+        stamp["resumed"] = [*read_stamp(run.root).get("resumed", []), stamp["started"]]
+        stamp["started"] = read_stamp(run.root)["started"]
+    else:
+        run = RunFolder(_make_folder(Path(config.out)))
+        write_json(run.root / "config.json", asdict(config))
     write_json(run.root / "stamp.json", stamp)
     status = "interrupted"
     try:
@@ -82,6 +88,27 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
         raise
     finally:
         write_json(run.root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
+
+
+def forget_after(root: Path, round_number: int) -> None:
+    """Remove what a run has written of later rounds, which are about to be done again: events, models and videos."""
+    kept = [event for event in read_events(root / "metrics.jsonl") if event["round"] <= round_number]
+    write_atomically(root / "metrics.jsonl", b"".join((json.dumps(event) + "\n").encode() for event in kept))
+    for folder in [*root.glob("global_model/round_*"), *root.glob("evaluate/round_*")]:
+        if int(folder.name.removeprefix("round_")) > round_number:
+            shutil.rmtree(folder)
+
+
+def _check_resumable(root: Path, config: Config) -> None:
+    if not (root / "stamp.json").is_file():
+        raise ValueError(f"resume={str(root)!r} is not a run folder: it has no stamp.json")
+    if read_stamp(root)["status"] == "completed":
+        raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to go on with")
+    theirs = read_config(root)
+    if config_hash(theirs) != config_hash(config):
+        other = [name for name, value in asdict(theirs).items() if value != getattr(config, name)]
+        changed = sorted(set(other) - {"out", "num_threads", "resume"})
+        raise ValueError(f"resume={str(root)!r} was run with another {changed[0].replace('_', '-')}: its settings stay")
 
 
 def read_config(root: Path) -> Config:
@@ -104,7 +131,7 @@ def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
     Raises:
         ValueError: no run there, or a line of ``metrics.jsonl`` is not an event.
     """
-    events = [event for event in _read_events(Path(root) / "metrics.jsonl") if kind in (None, event["kind"])]
+    events = [event for event in read_events(Path(root) / "metrics.jsonl") if kind in (None, event["kind"])]
     fixed = ["round", "who", "kind", "time"]
     named = list(dict.fromkeys(key for event in events for key in event["values"] if key not in fixed))
     return pd.DataFrame([{**e["values"], **{key: e[key] for key in fixed}} for e in events], columns=fixed + named)
@@ -124,7 +151,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def config_hash(config: Config) -> str:
     """Return a short hash of what a run computes: all settings except where it writes and how many threads it uses."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads")}
+    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -192,7 +219,12 @@ def _commit() -> str | None:
     return described.stdout.strip() or None
 
 
-def _read_events(path: Path) -> list[dict[str, Any]]:
+def read_events(path: Path) -> list[dict[str, Any]]:
+    """Return the complete events of a ``metrics.jsonl``.
+
+    Raises:
+        ValueError: no such file, or a line of it is not an event.
+    """
     if not path.is_file():
         raise ValueError(f"{path.parent} is not a run folder: it has no {path.name}")
     lines = path.read_text().split("\n")[:-1]  # a line without its newline was cut off by a crash

@@ -5,15 +5,16 @@ The run folder's place is left in ``context.state["run"]["folder"]`` for whoever
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
 
-from fedvla_lib import clients, data, model, roster, run_folder, strategies, wire
+from fedvla_lib import checkpoint, clients, data, model, roster, run_folder, strategies, wire
+from fedvla_lib.checkpoint import Checkpoint
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import rollout_seeds, success_rate
-from fedvla_lib.params import load_arrays, shapes_of
+from fedvla_lib.params import Arrays, load_arrays, shapes_of
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.tasks import check_tasks
 from fedvla_lib.wire import Rollouts
@@ -22,8 +23,30 @@ ROUND_TIMEOUT_S = 4 * 3600.0  # a client that has not answered by then is left o
 CONNECT_TIMEOUT_S = 60.0  # how long to wait for clients to connect
 
 
-def build(tools: clients.Tools = clients.TOOLS, *, engine: str = "flower", progress: bool = False) -> ServerApp:
-    """Return the ServerApp; `engine` is written into the stamp, `progress` shows bars for rollouts."""
+class ClientStates(Protocol):
+    """An engine that can say, and restore, what its clients keep from round to round."""
+
+    def client_states(self) -> dict[str, Arrays]:
+        """Return what clients keep, by client and kind, then by name."""
+
+    def restore_clients(self, states: dict[str, Arrays]) -> None:
+        """Give clients back what they kept."""
+
+
+def build(
+    tools: clients.Tools = clients.TOOLS,
+    *,
+    engine: str = "flower",
+    progress: bool = False,
+    states: ClientStates | None = None,
+) -> ServerApp:
+    """Return the ServerApp.
+
+    Args:
+        engine: written into the stamp.
+        progress: show bars for rollouts.
+        states: reaches what clients keep, where the engine can; else only runs whose clients keep nothing can resume.
+    """
     app = ServerApp()
 
     @app.main()
@@ -31,23 +54,28 @@ def build(tools: clients.Tools = clients.TOOLS, *, engine: str = "flower", progr
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(grid, config, run, tools, progress)
+            federate(grid, config, run, tools, progress, states)
 
     return app
 
 
-def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, progress: bool) -> None:
-    """Carry out a federated run on `grid` and write it to `run`.
+def federate(
+    grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, progress: bool, states: ClientStates | None = None
+) -> None:
+    """Carry out a federated run on `grid`, or the rest of one, and write it to `run`.
 
     Raises:
         TooFewReplies: too few clients connected, or a round had fewer good replies than `config.min_replies`.
         ValueError: settings or data that cannot be used.
     """
     check_tasks(task_names(config))
+    before = _before(config, run, states)
     store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
     members, weights, stats = _introduce(grid, config, run)
     bundle = model.load_policy(config, stats)
-    arrays = bundle.shared_arrays()
+    arrays, done = bundle.shared_arrays(), 0
+    if before:  # in the order of the model, which is not that of the file
+        arrays, done = {name: before.arrays[name] for name in arrays}, before.round
     strategy = strategies.build(
         config,
         weights,
@@ -60,16 +88,60 @@ def federate(grid: Grid, config: Config, run: RunFolder, tools: clients.Tools, p
         min_replies=config.min_replies,
         seed=config.seed,
         exchange=config.exchange,
+        clip_norm=config.clip_norm,
+        rounds_done=done,
     )
+    if before:
+        strategy.remember(checkpoint.nested(before.strategy))
+    judge = Judge(config, store, bundle, run, progress)
     strategy.start(
         grid,
         wire.pack_arrays(arrays),
-        num_rounds=config.num_server_rounds,
+        num_rounds=config.num_server_rounds - done,
         timeout=ROUND_TIMEOUT_S,
         train_config=ConfigRecord({wire.STATS: wire.pack_stats(stats)}),
         evaluate_config=ConfigRecord({wire.STATS: wire.pack_stats(stats)}),
-        evaluate_fn=Judge(config, store, bundle, run, progress),
+        evaluate_fn=RoundEnd(judge, strategy, run, states, done),
     )
+
+
+@dataclass(frozen=True)
+class RoundEnd:
+    """Judges the model of a round, then keeps all that the next one needs. Flower calls it first for round 0."""
+
+    judge: "Judge"
+    strategy: strategies.Checked
+    run: RunFolder
+    states: ClientStates | None
+    done: int  # rounds completed by an earlier process
+
+    def __call__(self, flowers_round: int, record: ArrayRecord) -> MetricRecord | None:
+        """Close a round; what an earlier process closed stays as it is."""
+        if self.done and flowers_round == 0:
+            return None
+        number = self.done + flowers_round
+        measured = self.judge(number, record)
+        memory, kept = self.strategy.memory(), self.states.client_states() if self.states else {}
+        arrays = wire.unpack_arrays(record)
+        checkpoint.save(self.run.root, Checkpoint(number, arrays, checkpoint.flat(memory), checkpoint.flat(kept)))
+        return measured
+
+
+def _before(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
+    """Return where the run to be resumed stood after its last complete round, and clear what came of the next."""
+    if not config.resume:
+        return None
+    kept_by_clients = [name for name, kept in clients.keeps(config).items() if kept]
+    if kept_by_clients and not states:
+        raise ValueError(
+            f"{kept_by_clients[0]} lets clients keep something from round to round, which ended with the run on this "
+            "engine: resume on engine inline, or start anew"
+        )
+    found = checkpoint.load(run.root)
+    run_folder.forget_after(run.root, found.round)
+    if states:
+        states.restore_clients(checkpoint.nested(found.clients))
+    return found
 
 
 @dataclass(frozen=True)
@@ -126,7 +198,7 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[roster.Roste
             f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
             "required; the rejected ones are in metrics.jsonl"
         )
-    for one in introductions:
+    for one in introductions if not config.resume else []:
         run.log(0, roster.client_name(one.partition_id), "data", {"num_examples": one.num_examples})
     whole = sum(one.num_examples for one in introductions)
     weights = {node: one.num_examples / whole for node, one in zip(members.partition_of, introductions, strict=True)}

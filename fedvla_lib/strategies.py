@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
-from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi
+from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi, Krum
 
 from fedvla_lib import wire
 from fedvla_lib.config import Config
@@ -52,10 +52,13 @@ class Checked:
         min_replies: good training replies without which the run stops.
         seed: fixes who is drawn.
         exchange: how arrays are encoded on the way; see `quantise`.
+        clip_norm: longest movement of a client that counts whole; a longer one is shortened to it. 0: none is.
+        rounds_done: rounds of this run that an earlier process completed; Flower counts from 1 again.
         **flower: passed on to the Flower strategy.
     """
 
     _also: tuple[str, ...] = ()  # records of arrays a reply has beside the trained ones
+    _memory: tuple[str, ...] = ()  # attributes of the Flower strategy that last from round to round
 
     def __init__(
         self,
@@ -69,12 +72,15 @@ class Checked:
         min_replies: int = 1,
         seed: int = 0,
         exchange: str = "float32",
+        clip_norm: float = 0.0,
+        rounds_done: int = 0,
         **flower: Any,
     ) -> None:
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.roster, self.shapes, self.report, self.keep_rollouts = roster, shapes, report, keep_rollouts
         self.train_share, self.evaluate_share = train_share, evaluate_share
         self.min_replies, self.seed, self.exchange = min_replies, seed, exchange
+        self.clip_norm, self.rounds_done = clip_norm, rounds_done
         self._asked: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
@@ -83,6 +89,7 @@ class Checked:
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """Draw clients and address the global arrays, with their SHA-256, to each."""
+        server_round += self.rounds_done
         selection = self._select(self.train_share, server_round, 0)
         self._global = wire.unpack_arrays(arrays)
         config[wire.DIGEST] = digest(self._downward(arrays))
@@ -92,6 +99,7 @@ class Checked:
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """The same for evaluation; other clients may be drawn."""
+        server_round += self.rounds_done
         selection = self._select(self.evaluate_share, server_round, 1)
         if not selection.node_ids:
             return []
@@ -106,6 +114,7 @@ class Checked:
         Raises:
             TooFewReplies: fewer than `min_replies` passed.
         """
+        server_round += self.rounds_done
         good = self._good(server_round, "train", replies, self._check_train)
         if len(good) < self.min_replies:
             raise TooFewReplies(
@@ -115,17 +124,35 @@ class Checked:
         for reply in good if self.exchange != "float32" else []:
             self._restore(reply)
         self._take(server_round, good)
+        for reply in good if self.clip_norm else []:
+            self._clip(reply)
         arrays, metrics = super().aggregate_train(server_round, good)
         return _as_float32(arrays), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the replies that pass; a client without held-out episodes has nothing to average."""
+        server_round += self.rounds_done
         good = self._good(server_round, "evaluate", replies, _check_evaluate)
         for reply in good:
             name = self.roster.name(reply.metadata.src_node_id)
             self.keep_rollouts(server_round, name, wire.unpack_rollouts(reply.content))
         measured = [reply for reply in good if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
+
+    def memory(self) -> dict[str, Arrays]:
+        """Return what this strategy keeps from round to round beside the global arrays: by attribute, then by name."""
+        kept = {attribute: getattr(self, attribute) for attribute in self._memory}
+        return {
+            attribute: dict(value) if isinstance(value, dict) else {str(i): array for i, array in enumerate(value)}
+            for attribute, value in kept.items()
+            if value is not None
+        }
+
+    def remember(self, memory: dict[str, Arrays]) -> None:
+        """Take over what `memory` of another process returned."""
+        for attribute, arrays in memory.items():
+            listed = all(name.isdecimal() for name in arrays)
+            setattr(self, attribute, [arrays[str(i)] for i in range(len(arrays))] if listed else arrays)
 
     def _downward(self, arrays: ArrayRecord) -> Arrays:
         return encode(wire.unpack_arrays(arrays), DOWNWARD[self.exchange])
@@ -140,6 +167,16 @@ class Checked:
         """Put into a reply that carries a change the arrays that it makes of the global ones."""
         change = decode(wire.unpack_arrays(reply.content[wire.ARRAYS]), self.exchange)
         reply.content[wire.ARRAYS] = wire.pack_arrays({name: self._global[name] + change[name] for name in change})
+
+    def _clip(self, reply: Message) -> None:
+        """Shorten a client's movement to `clip_norm`, in its own direction."""
+        arrays = wire.unpack_arrays(reply.content[wire.ARRAYS])
+        moved = {name: array - self._global[name] for name, array in arrays.items()}
+        length = math.sqrt(sum(float(np.square(array, dtype=np.float64).sum()) for array in moved.values()))
+        if length > self.clip_norm:
+            share = np.float32(self.clip_norm / length)
+            shortened = {name: self._global[name] + share * array for name, array in moved.items()}
+            reply.content[wire.ARRAYS] = wire.pack_arrays(shortened)
 
     def _take(self, server_round: int, good: list[Message]) -> None:
         """Look at the good training replies before they are averaged: report where each client went."""
@@ -189,6 +226,9 @@ class Checked:
         _check_metrics(reply, wire.TRAIN_METRICS)
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{wire.EXAMPLES}=0: a client without training frames has no weight")
+        announced = self.roster.examples_of.get(reply.metadata.src_node_id, _examples(reply))
+        if _examples(reply) != announced:  # it would buy itself another weight in the average
+            raise ParameterError("examples", f"{wire.EXAMPLES}={_examples(reply)}, but it came with {announced}")
         wire.checked_arrays(reply.content, wire.NOTE, self.shapes, also=self._also, exchange=self.exchange)
 
 
@@ -206,17 +246,27 @@ class CheckedFedProx(Checked, FedProx):
 class CheckedFedAvgM(Checked, FedAvgM):
     """FedAvg with momentum on the server (Hsu et al. 2019, https://arxiv.org/abs/1909.06335)."""
 
+    _memory = ("momentum_vector",)
+
 
 class CheckedFedAdam(Checked, FedAdam):
     """Adam on the server, the averaged update as its gradient (Reddi et al. 2021, https://arxiv.org/abs/2003.00295)."""
+
+    _memory = ("m_t", "v_t")
 
 
 class CheckedFedYogi(Checked, FedYogi):
     """Yogi on the server: as FedAdam, with a second moment that grows more slowly (https://arxiv.org/abs/2003.00295)."""
 
+    _memory = ("m_t", "v_t")
+
 
 class CheckedFedMedian(Checked, FedMedian):
     """The median of each coordinate, every client counting alike (Yin et al. 2018, https://arxiv.org/abs/1803.01498)."""
+
+
+class CheckedKrum(Checked, Krum):
+    """The one model that lies closest to the others (Blanchard et al. 2017, https://arxiv.org/abs/1703.02757)."""
 
 
 class CheckedScaffold(Checked, FedAvg):
@@ -233,6 +283,7 @@ class CheckedScaffold(Checked, FedAvg):
     """
 
     _also = (wire.CONTROL,)
+    _memory = ("control",)
 
     def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
         super().__init__(**checked)
@@ -286,6 +337,8 @@ def build(config: Config, weights: dict[int, float], **checked: Any) -> Checked:
         return CheckedFedAdam(eta=rate, tau=ADAPTIVITY, **checked)
     if config.strategy == "fedyogi":
         return CheckedFedYogi(eta=rate, tau=ADAPTIVITY, **checked)
+    if config.strategy == "krum":
+        return CheckedKrum(num_malicious_nodes=config.num_malicious, **checked)
     if config.strategy == "scaffold":
         return CheckedScaffold(weights=weights, **checked)
     return {"fedavg": CheckedFedAvg, "fedmedian": CheckedFedMedian}[config.strategy](**checked)

@@ -1,4 +1,6 @@
-"""Run the Flower app on Flower's simulation runtime: a local SuperLink, `flwr run`, and the run's real status.
+"""Flower's own programs as this library starts them: a local SuperLink, `flwr run`, and the run's real status.
+
+`run_simulation` runs the app on Flower's simulation runtime; `deploy` adds SuperNodes to a SuperLink from here.
 
 These are the documented commands, wrapped because four of their habits trip a small machine: the SuperLink that
 `flwr run` starts by itself gives up after 15 s, a client asks for two cores, a failed run still exits with 0, and Ray,
@@ -11,18 +13,21 @@ import re
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from fedvla_lib.config import Config, check, to_run_config
+from fedvla_lib.credentials import ServerFiles
 
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
 STATUS_TRIES, POLL_S = 6, 5.0
@@ -48,37 +53,53 @@ class SuperLink:
 
     environment: dict[str, str]
     log: Path  # what the run printed
+    port: int = 0
+    files: ServerFiles | None = None  # of a SuperLink with TLS
 
-    def submit(self, app: Path, *options: str, timeout_s: float) -> str:
+    def submit(
+        self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None
+    ) -> str:
         """Start a run of the app, follow its log until the run ends, and return its id.
 
-        Following costs nothing, while each further `flwr` command costs seconds of computing time.
+        Following costs nothing, while each further `flwr` command costs seconds of computing time. Meanwhile `watch` is
+        called every second.
 
         Raises:
             FlowerRunError: the run was not accepted, or did not end in time.
         """
-        command = [_program("flwr"), "run", str(app), CONNECTION, *options, "--stream"]
+        command = [program("flwr"), "run", str(app), CONNECTION, *options, "--stream"]
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
-                process.wait(timeout_s)
+                _follow(process, timeout_s, watch)
             except subprocess.TimeoutExpired as error:
-                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {_reason(self.log)}") from error
+                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {reason(self.log)}") from error
             finally:
                 process.kill()
         accepted = re.search(r"Successfully started run (\d+)", self.log.read_text(errors="replace"))
         if not accepted:
-            raise FlowerRunError(f"flwr run failed: {_reason(self.log)}")
+            raise FlowerRunError(f"flwr run failed: {reason(self.log)}")
         return accepted[1]
 
     def status(self, run_id: str) -> tuple[str, str]:
         """Return a run's status, such as ``running`` or ``finished:completed``, and its details."""
-        command = [_program("flwr"), "list", CONNECTION, "--run-id", run_id, "--format", "json"]
-        done = subprocess.run(command, env=self.environment, capture_output=True, text=True)
-        answer = json.loads(done.stdout[done.stdout.find("{\n") :]) if "{\n" in done.stdout else {}
+        answer = self.ask("list", CONNECTION, "--run-id", run_id)
         if not answer.get("runs"):
-            raise FlowerRunError(f"flwr list failed: {_one_line(done.stderr or done.stdout)}")
+            raise FlowerRunError(f"flwr list knows no run {run_id}")
         return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
+
+
+    def ask(self, *command: str) -> dict[str, Any]:
+        """Return the JSON that a `flwr` command answers.
+
+        Raises:
+            FlowerRunError: the command failed.
+        """
+        whole = [program("flwr"), *command, "--format", "json"]
+        done = subprocess.run(whole, env=self.environment, capture_output=True, text=True)
+        if "{\n" not in done.stdout:
+            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(done.stderr or done.stdout)}")
+        return json.loads(done.stdout[done.stdout.find("{\n") :])
 
 
 def run_simulation(
@@ -90,18 +111,16 @@ def run_simulation(
         FlowerRunError: the run failed, or did not finish in time.
         ValueError: unusable settings, or no checkout with a pyproject.toml around this library.
     """
-    out = Path(config.out).resolve()
-    paths = {name: _absolute(getattr(config, name)) for name in ("data", "base")}
-    config = check(replace(config, out=str(out), num_threads=config.num_threads or cpus_per_client, **paths))
-    before = set(out.glob("*"))
+    config = check(replace(absolute(config), num_threads=config.num_threads or cpus_per_client))
+    before = run_folders(config)
     resources = f"client-resources-num-cpus={cpus_per_client} client-resources-num-gpus={gpus_per_client}"
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
         app, settings = stage_app(Path(folder)), write_settings(Path(folder), config)
-        with local_superlink(Path(folder)) as link:
+        with local_superlink(Path(folder), "--simulation") as link:
             federation = f"num-supernodes={config.num_clients} {resources}"
             options = ["--federation-config", federation, "--run-config", str(settings)]
-            _require_completed(link, _submit(link, app, options, timeout_s))
-    return max(set(out.glob("*")) - before)
+            require_completed(link, _submit(link, app, options, timeout_s))
+    return Path(config.resume) if config.resume else max(run_folders(config) - before)
 
 
 def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) -> str:
@@ -114,26 +133,45 @@ def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) ->
 
 
 @contextmanager
-def local_superlink(home: Path) -> Iterator[SuperLink]:
-    """Start a SuperLink in simulation mode on a free port, with `home` as FLWR_HOME, and stop it at the end.
+def local_superlink(home: Path, *options: str, files: ServerFiles | None = None) -> Iterator[SuperLink]:
+    """Start a SuperLink on a free port of this machine, with `home` as FLWR_HOME, and stop it at the end.
+
+    Args:
+        options: for ``flower-superlink``, such as ``--simulation``.
+        files: certificates; without them the connection is not encrypted.
 
     Raises:
         FlowerRunError: it did not answer within two minutes.
     """
-    port = _free_port()
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # Flower calls its programs
-    environment = {**os.environ, **OFFLINE, "FLWR_HOME": str(home), "PATH": path}
-    connection = f'[superlink.{CONNECTION}]\naddress = "127.0.0.1:{port}"\ninsecure = true\n'
+    port = free_port()
+    environment = flower_environment(home)
+    secure = f"root-certificates = {json.dumps(str(files.authority))}" if files else "insecure = true"
+    connection = f'[superlink.{CONNECTION}]\naddress = "127.0.0.1:{port}"\n{secure}\n'
     (home / "config.toml").write_text(f'[superlink]\ndefault = "{CONNECTION}"\n\n{connection}')
-    log = home / "superlink.log"
-    command = [_program("flower-superlink"), "--insecure", "--simulation", "--host", "127.0.0.1", "--port", str(port)]
-    with open(log, "wb") as output:
-        process = subprocess.Popen(command, env=environment, stdout=output, stderr=output, start_new_session=True)
+    protection = ["--insecure"]
+    if files:
+        protection = ["--ssl-ca-certfile", str(files.authority), "--ssl-certfile", str(files.certificate)]
+        protection += ["--ssl-keyfile", str(files.key)]
+    command = ["flower-superlink", *protection, *options, "--host", "127.0.0.1", "--port", str(port)]
+    process = start(command, environment, log := home / "superlink.log")
     try:
-        _wait_until_up(process, port, log)
-        yield SuperLink(environment, home / "run.log")
+        wait_until(lambda: answers(port, files), process, log, "the SuperLink")
+        yield SuperLink(environment, home / "run.log", port, files)
     finally:
-        _stop(process)
+        stop(process)
+
+
+def flower_environment(home: Path) -> dict[str, str]:
+    """Return the environment of Flower's programs: their files in `home`, no network but what they are told."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
+    return {**os.environ, **OFFLINE, "FLWR_HOME": str(home), "PATH": path}
+
+
+def start(command: list[str], environment: dict[str, str], log: Path) -> subprocess.Popen:
+    """Start one of Flower's programs in a session of its own, which `stop` ends whole."""
+    command = [program(command[0]), *command[1:]]
+    with open(log, "ab") as output:
+        return subprocess.Popen(command, env=environment, stdout=output, stderr=output, start_new_session=True)
 
 
 def stage_app(folder: Path) -> Path:
@@ -156,67 +194,104 @@ def write_settings(folder: Path, config: Config) -> Path:
     return path
 
 
-def _absolute(name: str) -> str:
-    """Flower's processes choose their own working directory; a hub id stays as it is."""
-    return str(Path(name).resolve()) if name and Path(name).exists() else name
+def absolute(config: Config) -> Config:
+    """Return settings with absolute paths: Flower's processes choose their own working directory. Hub ids stay."""
+    paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
+    found = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
+    return replace(config, out=str(Path(config.out).resolve()), **found)
 
 
-def _require_completed(link: SuperLink, run_id: str) -> None:
-    """`flwr run` exits with 0 for failed runs too, so ask; the status may lag behind the end of the log."""
+def run_folders(config: Config) -> set[Path]:
+    """Return the run folders there are where `config` writes."""
+    return {stamp.parent for stamp in Path(config.out).glob("*/stamp.json")}
+
+
+def require_completed(link: SuperLink, run_id: str) -> None:
+    """Ask how a run ended: `flwr run` exits with 0 for failed runs too, and the status may lag behind the log's end.
+
+    Raises:
+        FlowerRunError: it did not complete.
+    """
     for _ in range(STATUS_TRIES):
         status, details = link.status(run_id)
         if status.startswith("finished"):
             break
         time.sleep(POLL_S)
     if status != "finished:completed":
-        raise FlowerRunError(f"run {run_id} is {status} ({details}); {_reason(link.log)}")
+        raise FlowerRunError(f"run {run_id} is {status} ({details}); {reason(link.log)}")
 
 
-def _wait_until_up(process: subprocess.Popen, port: int, log: Path) -> None:
+def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, what: str) -> None:
+    """Wait for a program to be ready.
+
+    Raises:
+        FlowerRunError: it ended, or was not ready within two minutes; with the reason from its log.
+    """
     deadline = time.monotonic() + STARTUP_S
-    while not _answers(port):
+    while not is_up():
         if process.poll() is not None:
-            raise FlowerRunError(f"the SuperLink ended with status {process.poll()}; {_reason(log)}")
+            raise FlowerRunError(f"{what} ended with status {process.poll()}; {reason(log)}")
         if time.monotonic() > deadline:
-            raise FlowerRunError(f"the SuperLink did not answer within {STARTUP_S:.0f} s; {_reason(log)}")
+            raise FlowerRunError(f"{what} was not ready within {STARTUP_S:.0f} s; {reason(log)}")
         time.sleep(0.5)
 
 
-def _answers(port: int) -> bool:
+def answers(port: int, files: ServerFiles | None = None) -> bool:
+    """Whether a SuperLink on this machine says that it is well."""
+    scheme, trust = ("https", ssl.create_default_context(cafile=files.authority)) if files else ("http", None)
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2) as response:
+        with urllib.request.urlopen(f"{scheme}://127.0.0.1:{port}/health", timeout=2, context=trust) as response:
             return response.status == 200
     except (urllib.error.URLError, OSError):
         return False
 
 
-def _stop(process: subprocess.Popen) -> None:
-    """End the SuperLink and the processes it started: they share its session."""
-    for sign in (signal.SIGTERM, signal.SIGKILL):
+def _follow(process: subprocess.Popen, timeout_s: float, watch: Callable[[], None]) -> None:
+    """Wait for a process, calling `watch` every second and once at the end."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            process.wait(min(1.0, max(0.0, deadline - time.monotonic())))
+            return watch()
+        except subprocess.TimeoutExpired:
+            watch()
+            if time.monotonic() > deadline:
+                raise
+
+
+def stop(process: subprocess.Popen, signs: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
+    """End a program and the processes it started, which share its session: politely, then by force."""
+    for sign in signs:
         try:
             os.killpg(process.pid, sign)
             process.wait(timeout=15)
-            return
         except ProcessLookupError:
             return
         except subprocess.TimeoutExpired:
             continue
 
 
-def _program(name: str) -> str:
+def program(name: str) -> str:
     """Return a command of this interpreter's environment, whether or not that is on PATH."""
     beside = Path(sys.executable).parent / name
     return str(beside) if beside.exists() else name
 
 
-def _free_port() -> int:
+def is_free(port: int) -> bool:
+    """Whether nothing on this machine listens on a port."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def free_port() -> int:
+    """Return a port that nothing listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
-def _reason(log: Path) -> str:
-    """The first exception of a log, which is the cause of those after it, and how the log ends."""
+def reason(log: Path) -> str:
+    """Return the first exception of a log, which is the cause of those after it, and how the log ends."""
     text = log.read_text(errors="replace")
     found = FIRST_ERROR.search(text)
     cause = f"it began with {_one_line(found[1])}; " if found else ""

@@ -31,6 +31,7 @@ EXAMPLES = "num-examples"  # training frames: the weight of a client
 DIGEST = "sha256"  # of the arrays
 CONTROL_DIGEST = "sha256-control"
 PROXIMAL_MU = "proximal-mu"  # Flower's own key
+DATA = "data"  # in a node's config: the data set that is this client's own
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"
 ROLLOUT_NAME = re.compile(r"rollout_\w+\.(mp4|npz)", re.ASCII)

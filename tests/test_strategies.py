@@ -58,11 +58,13 @@ class Events(list):
         return {who: values["reason"] for _, who, kind, values in self if kind == "rejected"}
 
 
-def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, **options):
+def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, **options):
     """Return the aggregated arrays, the metrics and the events of one training round."""
     events = Events()
     grid = InlineGrid(app, num_clients, {})
-    roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
+    nodes = grid.get_node_ids()
+    examples_of = dict.fromkeys(nodes, announced) if announced else {}
+    roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of)
     strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None, **options)
     start = start or random_arrays(99)
     messages = strategy.configure_train(server_round, wire.pack_arrays(start), ConfigRecord(), grid)
@@ -164,6 +166,26 @@ def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault)
     for name in SHAPES:
         expected = (random_arrays(0)[name] + random_arrays(2)[name]) / 2
         np.testing.assert_allclose(averaged[name], expected, rtol=1e-6, atol=1e-7)
+
+
+def test_a_client_cannot_buy_weight_with_more_examples_than_it_came_with():
+    app = answering(lambda k, _: reply_content(random_arrays(k), examples=10**9 if k == 1 else 10))
+    averaged, _, events = one_round(app, 3, announced=10)
+    assert events.rejected() == {"client_1": "examples"}
+    expected = (random_arrays(0)["weight"] + random_arrays(2)["weight"]) / 2
+    np.testing.assert_allclose(averaged["weight"], expected, rtol=1e-6, atol=1e-7)
+
+
+def test_clipping_shortens_a_movement_and_keeps_its_direction():
+    start, far = random_arrays(99), random_arrays(99)
+    far = {name: array + 50 for name, array in far.items()}
+    app = answering(lambda k, _: reply_content(far))
+    averaged, _, _ = one_round(app, 2, start=start, clip_norm=2.0)
+    moved = np.concatenate([(averaged[name] - start[name]).ravel() for name in SHAPES])
+    assert np.linalg.norm(moved) == pytest.approx(2.0, rel=1e-5)
+    np.testing.assert_allclose(moved, moved[0], rtol=1e-4)
+    near, _, _ = one_round(app, 2, start=start, clip_norm=1e6)
+    np.testing.assert_allclose(near[next(iter(SHAPES))], far[next(iter(SHAPES))], rtol=1e-5)
 
 
 def test_the_reason_of_an_exception_reaches_the_events():

@@ -1,0 +1,124 @@
+"""Certificates and keys for a deployment: who is the server, and which nodes may join.
+
+TLS: a certificate authority of one's own signs the server's certificate; nodes and users are given the authority's
+certificate and so know the server. Node authentication: each node has a key, the server knows its public half. For a
+deployment that lasts, take certificates from your own authority; these are valid for a few days.
+"""
+
+import ipaddress
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+PEM, PKCS8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+NO_PASSWORD = serialization.NoEncryption()
+DAYS = 7
+CLOCK_SKEW = timedelta(minutes=5)  # between machines that are to trust each other
+
+
+@dataclass(frozen=True)
+class ServerFiles:
+    """Where the server's certificate, its key and the authority's certificate lie. Nodes get only `authority`."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class NodeKey:
+    """A node's private key, which never leaves it, and the public one, which the server is told."""
+
+    private: Path
+    public: Path
+
+
+def make_server(
+    folder: Path, hosts: Sequence[str] = ("localhost", "127.0.0.1"), *, until: datetime | None = None
+) -> ServerFiles:
+    """Make an authority and a server certificate signed by it; the authority's own key is not kept.
+
+    Args:
+        folder: where the files go.
+        hosts: names and addresses under which nodes reach the server.
+        until: end of validity, with a time zone; default a week from now. One in the past makes an expired certificate.
+    """
+    until = until or datetime.now(UTC) + timedelta(days=DAYS)
+    authority_key, server_key = ec.generate_private_key(ec.SECP384R1()), ec.generate_private_key(ec.SECP384R1())
+    authority_name = _name("federation authority")
+    authority = (
+        _certificate(authority_name, authority_name, authority_key, until)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(sign_certificates=True), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(authority_key.public_key()), critical=False)
+        .sign(authority_key, hashes.SHA256())
+    )
+    server = (
+        _certificate(_name("federation server"), authority_name, server_key, until)
+        .add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()), critical=False)
+        .sign(authority_key, hashes.SHA256())
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    files = ServerFiles(folder / "ca.crt", folder / "server.pem", folder / "server.key")
+    files.authority.write_bytes(authority.public_bytes(PEM))
+    files.certificate.write_bytes(server.public_bytes(PEM))
+    _write_secret(files.key, server_key.private_bytes(PEM, PKCS8, NO_PASSWORD))
+    return files
+
+
+def make_node_key(folder: Path, name: str) -> NodeKey:
+    """Make a key pair on the curve P-384, in the OpenSSH format that Flower reads, as `name` and ``name.pub``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    key, files = ec.generate_private_key(ec.SECP384R1()), NodeKey(folder / name, folder / f"{name}.pub")
+    _write_secret(files.private, key.private_bytes(PEM, serialization.PrivateFormat.OpenSSH, NO_PASSWORD))
+    openssh = serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
+    files.public.write_bytes(key.public_key().public_bytes(*openssh) + b"\n")
+    return files
+
+
+def _certificate(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(datetime.now(UTC), until) - timedelta(days=1) - CLOCK_SKEW)
+        .not_valid_after(until)
+    )
+
+
+def _usage(sign_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=True, key_cert_sign=sign_certificates, crl_sign=sign_certificates, content_commitment=False,
+        key_encipherment=False, data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write_secret(path: Path, content: bytes) -> None:
+    """Write a file that only its owner may read."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        file.write(content)

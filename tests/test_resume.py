@@ -1,0 +1,120 @@
+"""A server killed in the middle of a round: the run goes on, and ends in the bits of one that was not killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from fedvla_lib import checkpoint, engine, run_folder, superlink
+from fedvla_lib.checkpoint import Checkpoint
+from fedvla_lib.cli import main
+from fedvla_lib.config import from_profile, to_run_config
+
+MAIN = "import sys; from fedvla_lib.cli import main; sys.exit(main())"
+KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
+
+
+@pytest.fixture
+def tiny(recording, tmp_path):
+    return from_profile(
+        "tiny", base="nano", data=str(recording), num_clients=3, num_server_rounds=4, local_steps=2, eval_rollouts=0,
+        client_rollouts=0, num_threads=1, out=str(tmp_path / "outputs"),
+    )  # fmt: skip
+
+
+def start_and_kill(config, round_number):
+    """Run in a process of its own and end it without warning while clients train in a round; return the run folder."""
+    told = {key: value for key, value in to_run_config(config).items() if key != "resume" and value != ""}
+    switches = [f"--{key}" if value else f"--no-{key}" for key, value in told.items() if isinstance(value, bool)]
+    values = [f"--{key}={value}" for key, value in told.items() if not isinstance(value, bool)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", MAIN, "run", *switches, *values],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline and process.poll() is None:
+        folders = superlink.run_folders(config)
+        # The round before has its checkpoint, so the next has begun.
+        if folders and (max(folders) / f"checkpoints/round_{round_number - 1}").exists():
+            os.killpg(process.pid, signal.SIGKILL)
+            break
+        time.sleep(0.005)
+    assert process.wait() == -signal.SIGKILL
+    return max(superlink.run_folders(config))
+
+
+def last_model(root, rounds=4):
+    return load_file(root / f"global_model/round_{rounds}/model.safetensors")
+
+
+def assert_same_bits(left, right):
+    assert left.keys() == right.keys()
+    assert all(left[name].tobytes() == right[name].tobytes() for name in left)
+
+
+@pytest.mark.integration
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings", [{"strategy": "fedavg"}, KEEPING, {"strategy": "fedadam"}, {"strategy": "fedavgm"}],
+    ids=lambda settings: settings["strategy"],
+)  # fmt: skip
+def test_a_killed_run_ends_in_the_same_bits(tiny, settings, capsys):
+    config = replace(tiny, **settings)
+    whole = engine.run_inline(config, progress=False)
+    root = start_and_kill(replace(config, out=config.out + "_killed"), 3)
+    assert run_folder.read_stamp(root)["status"] == "running"  # nobody was left to say otherwise
+    assert main(["run", "--resume", str(root)]) == 0
+    assert_same_bits(last_model(root), last_model(whole))
+    assert run_folder.read_stamp(root)["status"] == "completed" and run_folder.read_stamp(root)["resumed"]
+    for kind in ("train", "evaluate", "drift", "data"):
+        found, wanted = (run_folder.read_metrics(one, kind)[["round", "who"]] for one in (root, whole))
+        assert found.values.tolist() == wanted.values.tolist()
+
+
+@pytest.mark.integration
+def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
+    done = engine.run_inline(replace(tiny, num_server_rounds=1), progress=False)
+    refusals = {
+        (str(done),): "completed run",
+        (str(tmp_path / "nowhere"),): "no run folder there",
+        (str(done), "--lr", "0.1"): "--lr cannot be given with --resume",
+    }
+    for arguments, words in refusals.items():
+        assert main(["run", "--resume", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert words in said and len(said.splitlines()) == 1
+    stamp = run_folder.read_stamp(done)
+    run_folder.write_json(done / "stamp.json", stamp | {"status": "running"})
+    for folder in (done / "checkpoints").glob("round_*"):
+        (folder / "arrays.safetensors").write_bytes(b"half of it")
+    assert main(["run", "--resume", str(done)]) == 2
+    assert "is damaged" in capsys.readouterr().err
+    assert json.loads((done / "stamp.json").read_text())["status"].startswith("failed")
+
+
+@pytest.mark.unit
+def test_a_checkpoint_is_whole_or_absent_and_only_the_last_two_stay(tmp_path, monkeypatch):
+    arrays = {"w": np.arange(3, dtype=np.float32), "v": np.float64(2.0) * np.ones((2, 2))}
+    for number in range(4):
+        checkpoint.save(tmp_path, Checkpoint(number, arrays, {}, checkpoint.flat({"1:control": arrays})))
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["round_2", "round_3"]
+    found = checkpoint.load(tmp_path)
+    assert found.round == 3 and found.arrays["v"].dtype == np.float64
+    assert checkpoint.nested(found.clients)["1:control"]["w"].tolist() == [0, 1, 2]
+
+    def full(content, path):
+        if path.name.startswith("clients"):
+            raise OSError(28, "No space left on device")
+        save_file(content, path)
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(tmp_path, Checkpoint(4, arrays, {}, {}))
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["round_2", "round_3"]
