@@ -4,10 +4,12 @@ Errors are not caught here: Flower turns them into error replies, which the serv
 """
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
+from flwr.clientapp.typing import Mod
 
 from fedvla_lib import clients, wire
 from fedvla_lib.config import from_run_config
@@ -22,9 +24,13 @@ OWN = "own"  # the parts of the model that are personal
 LEFT_OVER = "left-over"  # of its changes, what rounding has kept from the server so far
 
 
-def build(tools: clients.Tools = clients.TOOLS) -> ClientApp:
-    """Return the ClientApp with handlers for query (statistics), train and evaluate."""
-    app = ClientApp()
+def build(tools: clients.Tools = clients.TOOLS, mods: Sequence[Mod] = ()) -> ClientApp:
+    """Return the ClientApp with handlers for query (statistics), train and evaluate.
+
+    Args:
+        mods: Flower's functions around a handler, the outermost first.
+    """
+    app = ClientApp(mods=list(mods))
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
