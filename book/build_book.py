@@ -39,6 +39,7 @@ RESULTS_ON = {
     "book/speed.md": [
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
     ],
+    "book/scale.md": ["scale"],
 }  # fmt: skip
 TITLES = {
     "fine_tuning": "what it is worth: each task learned alone from the base, on one core",

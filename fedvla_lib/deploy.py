@@ -19,7 +19,6 @@ from fedvla_lib.config import Config, check
 from fedvla_lib.superlink import CONNECTION, FlowerRunError, SuperLink
 
 CONNECTED = "SuperNode ID:"  # what a SuperNode logs once the SuperLink has let it in
-STILL_KNOWN = "Failed to activate SuperNode"  # what it logs while the SuperLink takes an earlier node for alive
 SHOWN = ("loss", "success_rate", "num_examples", "reason", "detail")
 
 
@@ -41,18 +40,19 @@ class Deployment:
     def start_node(self, partition_id: int) -> None:
         """Start the SuperNode of a client and wait until the SuperLink has let it in.
 
-        A SuperLink turns a key away until it has noticed that the node which used it before is gone, so this tries
-        again, as a host's service manager would.
+        A SuperLink turns a known key away until it has noticed that the node which used it before is gone, so for a
+        node that was in before this tries again, as a host's service manager would.
 
         Raises:
             FlowerRunError: it was refused, or did not get through; the message holds its own words.
         """
+        was_in = _count(self.log(partition_id)) > 0
         deadline = time.monotonic() + superlink.STARTUP_S
         while True:
             try:
                 return self._try_node(partition_id)
-            except FlowerRunError as error:
-                if STILL_KNOWN not in str(error) or time.monotonic() > deadline:
+            except FlowerRunError:
+                if not was_in or time.monotonic() > deadline:
                     raise
                 time.sleep(superlink.POLL_S)
 

@@ -162,9 +162,13 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
 
 
 def flower_environment(home: Path) -> dict[str, str]:
-    """Return the environment of Flower's programs: their files in `home`, no network but what they are told."""
+    """Return the environment of Flower's programs: their files in `home`, no network but what they are told.
+
+    Notebooks ask every program for colours, which would stand inside the JSON that `ask` reads.
+    """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
-    return {**os.environ, **OFFLINE, "FLWR_HOME": str(home), "PATH": path}
+    plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "CLICOLOR_FORCE")}
+    return {**plain, **OFFLINE, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
 
 
 def start(command: list[str], environment: dict[str, str], log: Path) -> subprocess.Popen:

@@ -75,6 +75,12 @@ def test_a_federation_is_measured_against_its_clients(tmp_path):
     assert row["peak memory [MB]"] > 0
 
 
+def test_rounds_are_timed_for_each_number_of_clients(tmp_path):
+    rows = run("scale", tmp_path, "--clients", "2", "13", "--engines", "inline")
+    assert [row["clients"] for row in rows] == [2, 13]  # more than the recording has episodes
+    assert all(row["later rounds [s]"] > 0 and row["peak memory [MB]"] > 100 for row in rows)
+
+
 def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path):
     model.save_policy(model.load_policy(from_profile("tiny")), tmp_path / "policy")
     arguments = ["--policy", str(tmp_path / "policy"), "--rollouts", "2", "--batch", "2"]
