@@ -50,6 +50,15 @@ def test_heavy_packages_stay_behind_their_fence(package):
     assert users - TOP <= FENCES[package]
 
 
+def test_nothing_can_load_a_pickle():
+    """Weights are safetensors; whoever imports one of these could run what a stranger sent."""
+    loaders = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
+    assert not {name for name, tree in MODULES.items() if {i.split(".")[0] for i in imports(tree)} & loaders}
+    called = {name: ast.unparse(tree) for name, tree in MODULES.items()}
+    words = ("torch.load", "read_pickle", "allow_pickle=True")
+    assert not {name for name, code in called.items() if any(word in code for word in words)}
+
+
 def test_imports_run_one_way():
     order = list(TopologicalSorter({name: ours(name) for name in MODULES}).static_order())
     assert order.index("spec") < order.index("engine")

@@ -1,13 +1,15 @@
 """Averaging and its checks, with Flower's own messages and apps on small arrays: no robot policy is needed here."""
 
 import hashlib
+import io
 
 import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
-from fedvla_lib import wire
+from fedvla_lib import strategies, wire
+from fedvla_lib.config import Config
 from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
 from fedvla_lib.params import digest, shapes_of
 from fedvla_lib.roster import Roster, TooFewReplies, call, wait_for_nodes
@@ -58,14 +60,17 @@ class Events(list):
         return {who: values["reason"] for _, who, kind, values in self if kind == "rejected"}
 
 
-def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, **options):
+def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, config=None, **options):
     """Return the aggregated arrays, the metrics and the events of one training round."""
     events = Events()
     grid = InlineGrid(app, num_clients, {})
     nodes = grid.get_node_ids()
     examples_of = dict.fromkeys(nodes, announced) if announced else {}
     roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of)
-    strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None, **options)
+    options = {"shapes": SHAPES, "report": events.log, "keep_rollouts": lambda *_: None, **options}
+    config = config or Config()
+    options.setdefault("clip_norm", config.clip_norm)
+    strategy = strategies.build(config, {node: 1 / num_clients for node in nodes}, roster=roster, **options)
     start = start or random_arrays(99)
     messages = strategy.configure_train(server_round, wire.pack_arrays(start), ConfigRecord(), grid)
     replies = grid.send_and_receive(messages)
@@ -133,6 +138,21 @@ def _raise():
 
 GOOD = random_arrays(1)
 UNDECODABLE = ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array("float32", (3,), "numpy.ndarray", b"not an array")})
+
+
+class Trap:
+    """Unpickled, it would leave a file behind."""
+
+    def __reduce__(self):
+        return open, ("unpickled", "w")
+
+
+def _pickled():
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([Trap()], dtype=object), allow_pickle=True)
+    return ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array("object", (1,), "numpy.ndarray", buffer.getvalue())})
+
+
 FAULTS = {
     "nan": ("non-finite", lambda: reply_content(_nan(GOOD))),
     "wrong shape": ("shape", lambda: reply_content({**GOOD, "bias": np.zeros(4, np.float32)})),
@@ -140,6 +160,7 @@ FAULTS = {
     "missing array": ("names", lambda: reply_content(_without(GOOD, "gain"))),
     "wrong dtype": ("dtype", lambda: reply_content({n: a.astype(np.float64) for n, a in GOOD.items()})),
     "undecodable bytes": ("dtype", lambda: {**reply_content(GOOD), wire.ARRAYS: UNDECODABLE}),
+    "a pickle": ("dtype", lambda: {**reply_content(GOOD), wire.ARRAYS: _pickled()}),
     "wrong hash": ("hash", lambda: {**reply_content(GOOD), wire.NOTE: wire.note(sha256=hashlib.sha256().hexdigest())}),
     "no hash": ("hash", lambda: _without(reply_content(GOOD), wire.NOTE)),
     "no arrays": ("names", lambda: _without(reply_content(GOOD), wire.ARRAYS)),
@@ -156,7 +177,8 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault):
+def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     reason, bad = FAULTS[fault]
     app = answering(lambda k, _: bad() if k == 1 else reply_content(random_arrays(k)))
     averaged, _, events = one_round(app, 3, min_replies=2)
@@ -166,6 +188,33 @@ def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault)
     for name in SHAPES:
         expected = (random_arrays(0)[name] + random_arrays(2)[name]) / 2
         np.testing.assert_allclose(averaged[name], expected, rtol=1e-6, atol=1e-7)
+    assert not list(tmp_path.iterdir())  # nothing that came was run
+
+
+def flat(arrays):
+    return np.concatenate([arrays[name].ravel() for name in SHAPES])
+
+
+@pytest.mark.parametrize("factor", [-20.0, -1.0, 50.0], ids=["scaled and turned", "turned", "scaled"])
+def test_one_poisoned_client_of_ten_breaks_fedavg_and_not_the_robust_strategies(factor):
+    """Honest clients move alike; the tenth sends its movement times a factor, with the right hash."""
+    start, wanted = random_arrays(99), random_arrays(98)
+
+    def moved(k, _):
+        noise = random_arrays(k, scale=0.2)
+        times = factor if k == 0 else 1.0
+        return reply_content({name: start[name] + np.float32(times) * (wanted[name] + noise[name]) for name in SHAPES})
+
+    servers = {
+        "fedavg": {}, "fedmedian": {"strategy": "fedmedian"}, "krum": {"strategy": "krum"},
+        "clipped": {"clip_norm": float(np.linalg.norm(flat(wanted)))},
+    }  # fmt: skip
+    off = {}
+    for name, settings in servers.items():
+        arrays, _, _ = one_round(answering(moved), 10, start=start, config=Config(**settings))
+        off[name] = np.linalg.norm(flat(arrays) - flat(start) - flat(wanted)) / np.linalg.norm(flat(wanted))
+    assert off["fedmedian"] < 0.2 and off["krum"] < 0.5 and off["clipped"] < 0.35
+    assert off["fedavg"] > (2 * off["fedmedian"] if factor == -1.0 else 1.5)
 
 
 def test_a_client_cannot_buy_weight_with_more_examples_than_it_came_with():
