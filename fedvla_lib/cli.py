@@ -22,6 +22,7 @@ from fedvla_lib.spec import CAMERAS, image_key
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
 DOWN = 3  # as service managers report a service that is not running
+LOCAL = "local"  # who acts and is measured where there is no federation
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 
@@ -65,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_experiment(commands)
     _add_search(commands)
+    _add_compare(commands)
     return parser
 
 
@@ -164,6 +166,19 @@ def _add_search(commands: Any) -> None:
     parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="attempts at each task (default: 20)")
     parser.add_argument("--search-out", type=Path, required=True, metavar="DIR", help="folder of trials and result")
     _add_settings(parser)
+
+
+def _add_compare(commands: Any) -> None:
+    parser = _command(commands, "compare", compare, "compare runs on the same held-out episodes and rollouts")
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folders; the first is the reference")
+    default = "loss,action_accuracy,success_rate"
+    text = f"measurements, separated by commas (default: {default})"
+    parser.add_argument("--metrics", default=default, metavar="NAMES", help=text)
+    parser.add_argument("--confidence", type=float, default=0.95, help="of the intervals (default: 0.95)")
+    parser.add_argument("--seed", type=int, default=42, help="fixes the bootstrap (default: 42)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for JSON, CSV and a figure (default: none)")
+    text = "compare runs that measured or spent different things, over what they have in common, and say so"
+    parser.add_argument("--allow-mismatch", action="store_true", help=text)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -298,11 +313,32 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
     resume = options.resume is not None
     result = local_train(bundle, batches, chosen, steps=steps, checkpoint_dir=checkpoints, resume=resume)
     save_policy(bundle, folder.root / "model")
-    frames, measured = learner.validate(bundle)
-    folder.log(0, "local", "evaluate", measured)
+    frames, measured = _measure_into(folder, chosen, learner.store, bundle)
+    folder.log(0, LOCAL, "evaluate", {"gradient_steps": steps, "num_examples": frames, **measured})
     print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
     print(f"on {frames} held-out frames: " + ", ".join(f"{name} {value:.3f}" for name, value in measured.items()))
     print(folder.root / "model")
+
+
+def _measure_into(folder: Any, chosen: Config, store: Any, bundle: Any) -> tuple[int, dict[str, float]]:
+    """Log held-out measurements and rollouts as a federation does of its global model, and return the averages."""
+    from fedvla_lib import clients
+    from fedvla_lib.evaluate import rollout_seeds, success_rate
+    from fedvla_lib.train import average
+
+    held_out = clients.held_out_episodes(store, chosen)
+    frames = clients.held_out_frames(bundle, store, held_out, chosen)
+    episodes = clients.by_episode(frames, store, held_out)
+    for of_episode in episodes:
+        folder.log(0, LOCAL, "held-out", of_episode)
+    measured = average(frames) if frames else {}
+    if chosen.eval_rollouts:
+        seeds = rollout_seeds(chosen.eval_rollouts)
+        rows = clients.roll_out(bundle, chosen, seeds, folder.videos_dir(0, LOCAL), True)
+        for row in rows:
+            folder.log(0, LOCAL, "rollout", {**row, "video": folder.relative(row["video"])})
+        measured["success_rate"] = success_rate(rows)
+    return sum(of_episode["num_examples"] for of_episode in episodes), measured
 
 
 def _learner(chosen: Config, client: int | None) -> Any:
@@ -430,6 +466,33 @@ def evaluate(options: argparse.Namespace) -> None:
     if options.out:
         write_atomically(options.out / "rows.csv", rows.to_csv(index=False).encode())
     _print_table(success_table(rows, ["task"]))
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Print what runs measured and how they differ; refuse runs that cannot be compared."""
+    from fedvla_lib import compare_runs
+
+    metrics = compare_runs.check_metrics(options.metrics.split(","))
+    if len(options.runs) < 2 or len({path.resolve() for path in options.runs}) < len(options.runs):
+        raise ValueError(f"runs {', '.join(map(str, options.runs))}: give two or more different run folders")
+    if not 0.5 <= options.confidence < 1:
+        raise ValueError(f"--confidence {options.confidence} is not usable: give 0.5 or more, below 1")
+    runs = [compare_runs.read_run(path) for path in options.runs]
+    differ = compare_runs.mismatches(runs, metrics)
+    if differ and not options.allow_mismatch:
+        raise ValueError(f"not comparable: {'; '.join(differ)} (--allow-mismatch compares what they have in common)")
+    chosen = {"seed": options.seed, "confidence": options.confidence}
+    tables = {
+        "values": compare_runs.values(runs, metrics, **chosen),
+        "differences": compare_runs.differences(runs, metrics, **chosen),
+    }
+    for line in differ:
+        print(f"MISMATCH: {line}")
+    for table in tables.values():
+        _print_table(table)
+    if options.out:
+        compare_runs.write(options.out, runs, tables, differ)
+        print(options.out / "comparison.json")
 
 
 def _saved_settings(folder: Path) -> Config:

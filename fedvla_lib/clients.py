@@ -178,12 +178,32 @@ def held_out_episodes(store: data.FrameStore, config: Config) -> list[int]:
 def validate(
     bundle: model.Bundle, store: data.FrameStore, episode_ids: Sequence[int], config: Config
 ) -> tuple[int, dict[str, float]]:
-    """Measure a policy on every fifth frame of the episodes: number of frames, and `train.validate`'s numbers."""
+    """Measure a policy on every fifth frame of the episodes: number of frames, and `train.measure_frames`' averages."""
+    frames = held_out_frames(bundle, store, episode_ids, config)
+    return (len(frames["loss"]), train.average(frames)) if frames else (0, {})
+
+
+def held_out_frames(
+    bundle: model.Bundle, store: data.FrameStore, episode_ids: Sequence[int], config: Config
+) -> dict[str, np.ndarray]:
+    """Return `train.measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
     batches = held_out_batches(store, episode_ids, config)
     if not batches:
-        return 0, {}
-    metrics = train.validate(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
-    return sum(len(batch["task"]) for batch in batches), metrics
+        return {}
+    return train.measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
+
+
+def by_episode(
+    frames: dict[str, np.ndarray], store: data.FrameStore, episode_ids: Sequence[int]
+) -> list[dict[str, float]]:
+    """Return averages for each episode of what `held_out_frames` measured, with episode_id and num_examples."""
+    counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in _spans(store, episode_ids)]
+    ends = np.cumsum(counts)
+    of_each = [{name: of[end - n : end] for name, of in frames.items()} for n, end in zip(counts, ends, strict=True)]
+    return [
+        {"episode_id": episode, "num_examples": n, **train.average(of)}
+        for episode, n, of in zip(episode_ids, counts, of_each, strict=True)
+    ]
 
 
 def roll_out(

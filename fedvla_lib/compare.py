@@ -5,11 +5,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import bootstrap
+from scipy.optimize import brentq
+from scipy.stats import bootstrap, norm, permutation_test
 from statsmodels.stats.contingency_tables import mcnemar
-from statsmodels.stats.proportion import proportion_confint
+from statsmodels.stats.multitest import multipletests
+from statsmodels.stats.proportion import proportion_confint, proportion_effectsize
 
 CONFIDENCE = 0.95
+POWER = 0.8
 
 
 def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -61,21 +64,84 @@ def paired_difference(
     one arm alone solved.
     """
     outcomes = paired(rows, arm, other)
-    both = outcomes.to_numpy()
-    counts = [[int((both[:, 0] & both[:, 1]).sum()), int((both[:, 0] & ~both[:, 1]).sum())]]
-    counts += [[int((~both[:, 0] & both[:, 1]).sum()), int((~both[:, 0] & ~both[:, 1]).sum())]]
-    low, high = bootstrap_mean(both[:, 0].astype(float) - both[:, 1], seed=seed, confidence=confidence)
+    found = success_difference(outcomes[arm], outcomes[other], seed=seed, confidence=confidence)
+    named = {"only_left": "only_arm", "only_right": "only_other"}
+    return {"arm": arm, "other": other, **{named.get(key, key): value for key, value in found.items()}}
+
+
+def success_difference(
+    left: Sequence[bool], right: Sequence[bool], *, seed: int, confidence: float = CONFIDENCE
+) -> dict[str, Any]:
+    """Difference of two success rates over the same attempts: left - right, bootstrap interval, McNemar's exact test.
+
+    Returns:
+        n: pairs; difference, low, high; only_left, only_right: attempts that one of them alone solved; p_value;
+        effect: Cohen's h (Cohen 1988), the difference of the rates' arcsine transforms; visible: the smallest
+        difference that n pairs with this share of unequal outcomes would show with a power of 80 %.
+    """
+    left, right = np.asarray(left, bool), np.asarray(right, bool)
+    table = [[int((left & right).sum()), int((left & ~right).sum())],
+             [int((~left & right).sum()), int((~left & ~right).sum())]]  # fmt: skip
+    low, high = bootstrap_mean(left.astype(float) - right, seed=seed, confidence=confidence)
+    only_left, only_right = table[0][1], table[1][0]
     return {
-        "arm": arm,
-        "other": other,
-        "n": len(both),
-        "difference": float(both[:, 0].mean() - both[:, 1].mean()),
-        "low": low,
-        "high": high,
-        "only_arm": counts[0][1],
-        "only_other": counts[1][0],
-        "p_value": float(mcnemar(counts, exact=True).pvalue),
-    }
+        "n": len(left), "difference": float(left.mean() - right.mean()), "low": low, "high": high,
+        "only_left": only_left, "only_right": only_right, "p_value": float(mcnemar(table, exact=True).pvalue),
+        "effect": float(proportion_effectsize(left.mean(), right.mean())),
+        "visible": smallest_difference(len(left), (only_left + only_right) / len(left), confidence),
+    }  # fmt: skip
+
+
+def mean_difference(
+    left: np.ndarray, right: np.ndarray, *, seed: int, confidence: float = CONFIDENCE
+) -> dict[str, Any]:
+    """Difference of two means over the same units: left - right, paired bootstrap, test by turning signs of pairs.
+
+    Returns:
+        n: pairs; difference, low, high; p_value (Fisher 1935: if left and right were alike, each difference could as
+        well have the other sign); effect: Cohen's d of the pairs; visible: the smallest difference that n pairs which
+        spread like these would show with a power of 80 %.
+    """
+    each = np.asarray(left, float) - np.asarray(right, float)
+    low, high = bootstrap_mean(each, seed=seed, confidence=confidence)
+    spread = float(each.std(ddof=1)) if len(each) > 1 else 0.0
+    reach = sum(norm.ppf([1 - (1 - confidence) / 2, POWER]))
+    return {
+        "n": len(each), "difference": float(each.mean()), "low": low, "high": high,
+        "p_value": _sign_test(each, seed), "effect": float(each.mean() / spread) if spread else float("nan"),
+        "visible": float(reach * spread / np.sqrt(len(each))),
+    }  # fmt: skip
+
+
+def _sign_test(each: np.ndarray, seed: int) -> float:
+    if len(each) < 2 or not each.any():
+        return 1.0
+    chosen = {"permutation_type": "samples", "n_resamples": 9999, "rng": np.random.default_rng(seed)}
+    return float(permutation_test((each,), np.mean, **chosen).pvalue)
+
+
+def smallest_difference(n: int, discordant: float, confidence: float = CONFIDENCE, power: float = POWER) -> float:
+    """Smallest difference of two success rates that `n` pairs show with the given power; NaN if none is possible.
+
+    Args:
+        discordant: share of pairs with unequal outcomes.
+
+    Source: Connor 1987, Biometrics 43, eq. 2, solved for the difference d of McNemar's test:
+    sqrt(n) d = z_a sqrt(discordant) + z_b sqrt(discordant - d²).
+    """
+    z_a, z_b = norm.ppf([1 - (1 - confidence) / 2, power])
+
+    def short(d: float) -> float:
+        return z_a * np.sqrt(discordant) + z_b * np.sqrt(max(discordant - d * d, 0)) - np.sqrt(n) * d
+
+    if discordant <= 0 or short(discordant) > 0:  # a difference cannot exceed the share of unequal pairs
+        return float("nan")
+    return float(brentq(short, 0, discordant))
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """Return p-values corrected for being several (Holm 1979)."""
+    return multipletests(p_values, method="holm")[1]
 
 
 def bootstrap_mean(values: np.ndarray, *, seed: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

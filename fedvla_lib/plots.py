@@ -5,6 +5,7 @@ distinct for colour-blind readers. One arm and one joint keep one colour through
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -537,6 +538,35 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xlabel("difference in success rate [points], 95 % bootstrap interval")
     ax.set_ylabel("pair of arms")
     return ax
+
+
+def run_differences(table: pd.DataFrame, *, note: str = "") -> Sequence[Axes]:
+    """Draw each metric's differences to the first run with their intervals; columns run, against, metric, difference...
+
+    Args:
+        note: what makes the runs incomparable; it becomes the title.
+    """
+    metrics = list(dict.fromkeys(table.metric))
+    figure, axes = plt.subplots(1, len(metrics), figsize=(WIDTH, 1.2 + 0.4 * table.run.nunique()), squeeze=False)
+    for ax, metric in zip(axes[0], metrics, strict=True):
+        part = table[table.metric == metric]
+        errors = np.abs(np.stack([part.difference - part.low, part.high - part.difference]))
+        ax.errorbar(part.difference, range(len(part)), xerr=errors, fmt="o", capsize=4, color=PALETTE[0])
+        ax.axvline(0, color="#555555", linewidth=1)
+        ax.set_yticks(range(len(part)), part.run if ax is axes[0][0] else [])
+        ax.set_ylim(len(part) - 0.5, -0.5)
+        ax.set_xlabel(metric.replace("_", " "))
+    axes[0][0].set_ylabel(f"run − {table.against.iloc[0]}")
+    figure.suptitle(f"not comparable: {note}" if note else "", fontsize=9, wrap=True)
+    figure.tight_layout()
+    return axes[0]
+
+
+def save(axes: Axes | Sequence[Axes], path: Path) -> None:
+    """Write the figure of the axes as a picture, and close it."""
+    figure = (axes if isinstance(axes, Axes) else axes[0]).figure
+    figure.savefig(path, bbox_inches="tight")
+    plt.close(figure)
 
 
 def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:

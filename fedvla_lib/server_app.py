@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
 
-from fedvla_lib import checkpoint, clients, data, model, roster, run_folder, strategies, wire
+from fedvla_lib import checkpoint, clients, data, model, roster, run_folder, strategies, train, wire
 from fedvla_lib.checkpoint import Checkpoint
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import rollout_seeds, success_rate
@@ -165,10 +165,14 @@ class Judge:
         load_arrays(self.bundle.policy, wire.unpack_arrays(arrays) | self.bundle.own)
         model.save_policy(self.bundle, self.run.model_dir(round_number))
         held_out = clients.held_out_episodes(self.store, self.config)
-        frames, values = clients.validate(self.bundle, self.store, held_out, self.config)
-        values |= self._roll_out(round_number)
+        frames = clients.held_out_frames(self.bundle, self.store, held_out, self.config)
+        episodes = clients.by_episode(frames, self.store, held_out)
+        for of_episode in episodes:
+            self.run.log(round_number, GLOBAL, "held-out", of_episode)
+        values = (train.average(frames) if frames else {}) | self._roll_out(round_number)
+        counted = {"num_examples": sum(of_episode["num_examples"] for of_episode in episodes)}
         seconds = time.perf_counter() - started
-        self.run.log(round_number, GLOBAL, "evaluate", {"num_examples": frames, **values, "seconds": seconds})
+        self.run.log(round_number, GLOBAL, "evaluate", {**counted, **values, "seconds": seconds})
         return MetricRecord(values)
 
     def _roll_out(self, round_number: int) -> dict[str, float]:

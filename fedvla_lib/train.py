@@ -112,10 +112,19 @@ def local_train(
 def validate(
     bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0
 ) -> dict[str, float]:
-    """Measure the policy on held-out raw batches with fixed noise and flow time, so that models can be compared.
+    """Measure the policy on held-out raw batches; see `measure_frames` and `average`."""
+    return average(measure_frames(bundle, batches, tolerance=tolerance, seed=seed))
+
+
+def measure_frames(
+    bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0
+) -> dict[str, np.ndarray]:
+    """Measure the policy on each held-out frame with fixed noise and flow time, so that models can be compared.
 
     Returns:
-        loss: flow-matching loss per valid action entry, in normalised units;
+        Arrays with an entry for each frame, over the valid actions of its chunk:
+        num_actions: how many they are;
+        loss: flow-matching loss, in normalised units;
         action_error: mean absolute error of the predicted joint targets, over all joints (degrees; gripper 0-100);
         action_accuracy: share of predicted joint targets within `tolerance` of the demonstration;
         action_error.<joint>: the same error for each joint.
@@ -123,31 +132,46 @@ def validate(
     if not batches:
         raise ValueError("no held-out batches: give at least one validation episode")
     generator = torch.Generator().manual_seed(seed)
-    loss_sum, errors = 0.0, []
-    for batch in batches:
-        valid = ~batch["action_is_pad"]  # (B, chunk)
-        loss_sum += _fixed_loss(bundle, batch, generator) * int(valid.sum())
-        difference = predict_chunk(bundle, batch, generator) - batch[ACTION_KEY]  # (B, chunk, 6)
-        errors.append(difference.abs()[valid].numpy())
-    error = np.concatenate(errors).astype(np.float64)  # (valid actions, 6)
-    by_joint = {f"action_error.{name}": float(e) for name, e in zip(JOINT_NAMES, error.mean(axis=0), strict=True)}
+    of_batches = [_measure(bundle, batch, generator, tolerance) for batch in batches]
+    return {name: np.concatenate([of_batch[name] for of_batch in of_batches]) for name in of_batches[0]}
+
+
+def average(frames: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the mean of each measurement over all valid actions of the given frames."""
+    weights = frames["num_actions"]
+    return {name: float(np.average(of, weights=weights)) for name, of in frames.items() if name != "num_actions"}
+
+
+def _measure(
+    bundle: Bundle, batch: dict[str, Any], generator: torch.Generator, tolerance: float
+) -> dict[str, np.ndarray]:
+    valid = ~batch["action_is_pad"].numpy()  # (B, chunk)
+    loss = _fixed_loss(bundle, batch, generator)
+    error = (predict_chunk(bundle, batch, generator) - batch[ACTION_KEY]).abs().double().numpy()  # (B, chunk, 6)
+    num_actions = valid.sum(axis=1)
+    by_joint = (error * valid[..., None]).sum(axis=1) / num_actions[:, None]
+    close = ((error <= tolerance) & valid[..., None]).sum(axis=(1, 2)) / (num_actions * error.shape[-1])
+    joints = {f"action_error.{name}": by_joint[:, i] for i, name in enumerate(JOINT_NAMES)}
     return {
-        "loss": loss_sum / len(error),
-        "action_error": float(error.mean()),
-        "action_accuracy": float((error <= tolerance).mean()),
-        **by_joint,
-    }
+        "num_actions": num_actions, "loss": loss, "action_error": by_joint.mean(axis=1), "action_accuracy": close,
+        **joints,
+    }  # fmt: skip
 
 
-def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> float:
-    """Flow-matching loss with noise ~ N(0, 1) and time spread evenly over (0, 1): x_t = t noise + (1 - t) action."""
+def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> np.ndarray:
+    """Flow-matching loss of each frame, (B,), with noise ~ N(0, 1) and time spread evenly over (0, 1).
+
+    x_t = t noise + (1 - t) action.
+    """
     settings = bundle.policy.config
     size = len(batch["task"])
     noise = torch.randn((size, settings.chunk_size, settings.max_action_dim), generator=generator)
     times = (torch.randperm(size, generator=generator) + 0.5) / size
     inputs = bundle.preprocess(dict(batch))
-    loss, _ = bundle.policy.forward(inputs, noise=noise.to(settings.device), time=times.to(settings.device))
-    return loss.item()
+    noise, times = noise.to(settings.device), times.to(settings.device)
+    with torch.no_grad():
+        loss, _ = bundle.policy.forward(inputs, noise=noise, time=times, reduction="none")
+    return loss.double().cpu().numpy()
 
 
 def _step(

@@ -82,3 +82,42 @@ def test_unpaired_rollouts_are_refused():
         compare.paired(rows(a=[1, 0], b=[1]), "a", "b")
     with pytest.raises(ValueError, match="twice"):
         compare.paired(pd.concat([rows(a=[1]), rows(a=[1], b=[1])]), "a", "b")
+
+
+def test_mean_difference_equals_the_enumeration_of_all_signs():
+    left, right = np.array([1.0, 2.0, 4.0, 3.0]), np.array([0.5, 2.5, 2.0, 1.0])
+    each = left - right
+    means = [np.mean(each * signs) for signs in product((1, -1), repeat=4)]
+    found = compare.mean_difference(left, right, seed=0)
+    assert found["p_value"] == pytest.approx(np.mean(np.abs(means) >= abs(each.mean()) - 1e-12))
+    assert found["difference"] == pytest.approx(1.0) and found["low"] <= 1.0 <= found["high"]
+    assert found["effect"] == pytest.approx(1.0 / np.std(each, ddof=1))
+
+
+def test_holm_by_hand():
+    assert compare.holm([0.01, 0.04, 0.03]).tolist() == pytest.approx([0.03, 0.06, 0.06])
+
+
+def test_the_smallest_visible_difference_is_seen_about_four_times_in_five():
+    """Pairs drawn with just that difference are found significant with the power that was asked for."""
+    n, discordant = 200, 0.3
+    d = compare.smallest_difference(n, discordant)
+    rng = np.random.default_rng(0)
+    pairs = rng.choice(3, size=(2000, n), p=[(discordant + d) / 2, (discordant - d) / 2, 1 - discordant])
+    only_left, only_right = (pairs == 0).sum(axis=1), (pairs == 1).sum(axis=1)
+    statistic = (only_left - only_right) / np.sqrt(np.maximum(only_left + only_right, 1))
+    assert np.mean(np.abs(statistic) > 1.96) == pytest.approx(0.8, abs=0.03)
+    assert np.isnan(compare.smallest_difference(5, 0.1))  # five pairs, half a disagreement: nothing can be seen
+
+
+@pytest.mark.parametrize("truth", [0.2, -0.05])
+def test_the_paired_interval_covers_a_known_difference(truth):
+    rng = np.random.default_rng(1)
+    n, covered = 150, 0
+    for k in range(300):
+        outcome = rng.choice(3, size=n, p=[0.2 + truth / 2, 0.2 - truth / 2, 0.6])  # only left, only right, alike
+        alike = rng.random(n) < 0.5
+        left, right = np.where(outcome == 2, alike, outcome == 0), np.where(outcome == 2, alike, outcome == 1)
+        found = compare.success_difference(left, right, seed=k)
+        covered += found["low"] <= truth <= found["high"]
+    assert 0.92 <= covered / 300 <= 0.98
