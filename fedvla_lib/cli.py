@@ -22,6 +22,7 @@ from fedvla_lib.spec import CAMERAS, image_key
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
 DOWN = 3  # as service managers report a service that is not running
+DAMAGED = 1  # something was found, and not all of it is sound
 LOCAL = "local"  # who acts and is measured where there is no federation
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
@@ -67,6 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_experiment(commands)
     _add_search(commands)
     _add_compare(commands)
+    _add_videos(commands)
     return parser
 
 
@@ -179,6 +181,16 @@ def _add_compare(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for JSON, CSV and a figure (default: none)")
     text = "compare runs that measured or spent different things, over what they have in common, and say so"
     parser.add_argument("--allow-mismatch", action="store_true", help=text)
+
+
+def _add_videos(commands: Any) -> None:
+    parser = _command(commands, "videos", videos, "check a run's videos and say what they show, round by round")
+    parser.add_argument("folder", type=Path, help="the evaluate folder of a run")
+    default = "success_rate,completion_time,action_smoothness"
+    text = f"measurements, separated by commas (default: {default})"
+    parser.add_argument("--metrics", default=default, metavar="NAMES", help=text)
+    parser.add_argument("--who", metavar="NAME", help="only global, or client_K (default: everybody)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for CSV and a figure (default: none)")
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -493,6 +505,31 @@ def compare(options: argparse.Namespace) -> None:
     if options.out:
         compare_runs.write(options.out, runs, tables, differ)
         print(options.out / "comparison.json")
+
+
+def videos(options: argparse.Namespace) -> int:
+    """Print a table for each measurement, and every damaged file; 1 if there is one."""
+    import pandas as pd
+
+    from fedvla_lib import videos as films
+
+    metrics = films.check_metrics(options.metrics.split(","))
+    rows, damaged = films.read_videos(options.folder)
+    if options.who and len(rows):
+        filmed = sorted(set(rows.who))
+        if options.who not in filmed:
+            raise ValueError(f"--who {options.who} filmed nothing there: choose from {', '.join(filmed)}")
+        rows = rows[rows.who == options.who]
+    if len(rows):
+        table = pd.concat([films.by_round(rows, metric) for metric in metrics], ignore_index=True)
+        _print_table(table)
+        if options.out:
+            films.write(options.out, rows, table, damaged)
+            print(options.out / "rounds.csv")
+    print(f"{len(rows)} rollouts whose videos are whole, {len(damaged)} damaged files")
+    for line in damaged:
+        print(f"fedvla videos: {line}", file=sys.stderr)
+    return DAMAGED if damaged else 0
 
 
 def _saved_settings(folder: Path) -> Config:

@@ -151,7 +151,7 @@ def read_video(path: Path) -> np.ndarray:
     try:
         with av.open(str(path)) as container:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
-    except (av.FFmpegError, ValueError, OSError) as error:
+    except (av.FFmpegError, ValueError, OSError, IndexError) as error:  # IndexError: no stream of pictures
         raise ValueError(f"{path} is not a readable video: {error}") from error
 
 

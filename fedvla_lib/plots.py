@@ -113,6 +113,15 @@ def by_round(table: pd.DataFrame, value: str, *, ylabel: str, label: str = "", a
     return ax
 
 
+def trends(table: pd.DataFrame, labels: dict[str, str]) -> Sequence[Axes]:
+    """Draw metrics against the round, a panel each; columns round, metric, value, low, high; labels by metric."""
+    metrics = list(dict.fromkeys(table.metric))
+    _, axes = plt.subplots(len(metrics), 1, figsize=(WIDTH, 2.6 * len(metrics)), squeeze=False, layout="constrained")
+    for ax, metric in zip(axes[:, 0], metrics, strict=True):
+        by_round(table[table.metric == metric], "value", ylabel=labels[metric], label="mean (band: 95 %)", ax=ax)
+    return axes[:, 0]
+
+
 def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw success rates with Wilson intervals; columns arm, task, success_rate, low, high."""
     ax = ax or _new_axes()

@@ -114,6 +114,13 @@ def test_the_result_does_not_depend_on_who_answers_first():
     assert dict(forward_metrics) == dict(backward_metrics)
 
 
+def test_twice_the_examples_count_as_being_there_twice():
+    once, _, _ = one_round(answering(lambda k, _: reply_content(random_arrays(k), examples=[10, 20][k])), 2)
+    twice, _, _ = one_round(answering(lambda k, _: reply_content(random_arrays([0, 1, 1][k]), examples=10)), 3)
+    for name in SHAPES:
+        np.testing.assert_allclose(once[name], twice[name], rtol=1e-6, atol=1e-7)
+
+
 def test_metrics_are_averaged_by_examples():
     app = answering(lambda k, _: reply_content(random_arrays(k), [30, 10][k], loss=[1.0, 5.0][k]))
     _, metrics, events = one_round(app, 2)
