@@ -171,7 +171,7 @@ def news(config: Config, before: set[Path], say: Callable[[str], None]) -> Calla
         for event in events[told:]:
             values = {key: event["values"][key] for key in SHOWN if event["values"].get(key) is not None}
             shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
-            if shown:
+            if shown and event["kind"] != "held-out":  # `evaluate` has their averages
                 say(f"round {event['round']}, {event['who']}, {event['kind']}: {shown}")
         told = len(events)
 
