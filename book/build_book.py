@@ -78,7 +78,8 @@ def notebook_key(notebook: Path, library: str) -> str:
     """Return the digest that decides whether `notebook` has to be executed again: it, the library, what it reads."""
     source = notebook.read_bytes()
     folders = sorted({notebook.parent / name.decode() for name in REFERENCE.findall(source)})
-    stored = [path.name.encode() + b"\0" + path.read_bytes() for folder in folders for path in sorted(folder.glob("*"))]
+    files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
+    stored = [_named_bytes(notebook.parent.parent, path.resolve()) for path in files]
     return _digest([library.encode(), notebook.name.encode(), source, *stored])
 
 

@@ -98,7 +98,7 @@ def _everything(config: Config) -> Client:
 
 def _pooled_stats(config: Config) -> str:
     """The statistics a federation pools, computed from all training episodes at once: they are equal."""
-    return wire.pack_stats(_everything(config).statistics())
+    return wire.pack_stats(clients.common_statistics(config, _everything(config).statistics()))
 
 
 def _key(config: Config) -> str:

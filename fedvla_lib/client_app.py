@@ -136,7 +136,9 @@ def _recall(context: Context, what: str) -> Arrays:
 
 def _policy(client: clients.Client, message: Message, tools: clients.Tools, context: Context) -> Bundle:
     """Return the policy holding the global arrays of the message, once they have passed every check, and its own."""
-    bundle = tools.load_policy(client.config, message.content[wire.CONFIG][wire.STATS])
+    own = client.config.normalisation == "own"
+    stats = wire.pack_stats(client.statistics()) if own else message.content[wire.CONFIG][wire.STATS]
+    bundle = tools.load_policy(client.config, stats)
     exchange = DOWNWARD[client.config.exchange]
     shapes = shapes_of(bundle.shared())
     arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes, also=(wire.CONTROL,), exchange=exchange)

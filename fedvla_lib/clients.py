@@ -57,6 +57,18 @@ def load_policy(config: Config, stats_text: str) -> model.Bundle:
 TOOLS = Tools(open_frames, load_policy)
 
 
+def common_statistics(config: Config, pooled: model.Stats) -> model.Stats:
+    """Return the statistics that all clients are sent: the pooled ones, unless nothing is to be normalised."""
+    return data.no_stats() if config.normalisation == "none" else pooled
+
+
+def judging_statistics(config: Config, common: model.Stats, store: data.FrameStore) -> model.Stats:
+    """Return the statistics that the global model is judged with: the common ones, or by mistake the held-out ones."""
+    if config.normalisation != "held-out":
+        return common
+    return data.episode_stats(store, held_out_episodes(store, config))
+
+
 @dataclass(frozen=True)
 class Client:
     """Client `partition_id` of a run."""
@@ -212,7 +224,7 @@ def roll_out(
     """Let one model act on all tasks of the mix, in the laboratories of the run, and return a row for each attempt."""
     return evaluate(
         model.PolicyActor(bundle, config.seed), task_names(config), seeds, image_size=config.image_size,
-        labs=labs(config.num_labs, config.seed), videos_dir=videos_dir, progress=progress,
+        labs=labs(config.num_labs), videos_dir=videos_dir, progress=progress,
     )  # fmt: skip
 
 
@@ -236,7 +248,7 @@ def tasks_of(store: data.FrameStore, episode_ids: Sequence[int]) -> list[str]:
 
 def labs_of(store: data.FrameStore, episode_ids: Sequence[int], config: Config) -> list[Lab]:
     """Return the laboratories in which the given episodes were recorded."""
-    there = labs(config.num_labs, config.seed)
+    there = labs(config.num_labs)
     found = sorted(set(store.episodes.set_index("episode_id").loc[list(episode_ids), "lab"]))
     return [there[int(index)] for index in found if index < len(there)] or [REFERENCE]
 

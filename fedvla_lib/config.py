@@ -22,6 +22,7 @@ class Config:
     image_size: int = 96  # side of the square camera images in pixels
     num_labs: int = 1  # laboratories the demonstrations come from: cameras, light, colours and calibration differ
     val_fraction: float = 0.1  # share of episodes held out for validation, per task
+    normalisation: str = "pooled"  # statistics of joints: pooled; or a mistake to measure: own, held-out, none
     augment: bool = False  # jitter training images; off, a frozen model's view of a frame is computed once and kept
     # federation
     num_clients: int = 10  # clients the episodes are partitioned over
@@ -123,6 +124,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     },
 }
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
+NORMALISATIONS = ("pooled", "own", "held-out", "none")
 EXCHANGES = ("float32", "float16", "int8")
 STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "krum", "scaffold")
 
@@ -204,6 +206,7 @@ def check(config: Config) -> Config:
         _require(0 <= getattr(config, name) <= 1, config, name, "a share from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a share above 0")
     _require(config.partition in PARTITIONS, config, "partition", f"one of {', '.join(PARTITIONS)}")
+    _require(config.normalisation in NORMALISATIONS, config, "normalisation", f"one of {', '.join(NORMALISATIONS)}")
     _require(config.strategy in STRATEGIES, config, "strategy", f"one of {', '.join(STRATEGIES)}")
     _require(config.exchange in EXCHANGES, config, "exchange", f"one of {', '.join(EXCHANGES)}")
     most = f"at most chunk_size={config.chunk_size}"

@@ -21,7 +21,7 @@ from lerobot.datasets import aggregate_stats
 from fedvla_lib.config import Config, cache_dir, code_digest, task_names
 from fedvla_lib.record import record
 from fedvla_lib.source import DataError
-from fedvla_lib.spec import ACTION_KEY, STATE_KEY, image_key
+from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES, STATE_KEY, image_key
 from fedvla_lib.store import FrameStore, open_store
 
 __all__ = [
@@ -93,6 +93,12 @@ def pool_stats(stats: Sequence[Stats]) -> Stats:
     sum(n_k (s_k^2 + (m_k - m)^2)) / sum(n_k), which is exact (LeRobot's `aggregate_stats`).
     """
     return aggregate_stats(list(stats))
+
+
+def no_stats() -> Stats:
+    """Return statistics that leave state and action as they are: mean 0 and std 1 of each joint."""
+    as_is = {"mean": np.zeros(len(JOINT_NAMES)), "std": np.ones(len(JOINT_NAMES))}
+    return {STATE_KEY: as_is, ACTION_KEY: as_is}
 
 
 def frame_rows(store: FrameStore, episode_ids: Iterable[int]) -> np.ndarray:

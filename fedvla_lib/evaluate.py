@@ -39,7 +39,7 @@ def evaluate(
     videos_dir: Path | None = None,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Run one rollout per task and seed, the seeds in the laboratories in turn, and return a row for each.
+    """Run one rollout per task and seed, seed s in laboratory s mod len(labs), and return a row for each.
 
     Row: task, instruction, seed, lab (its name), success (bool), steps, completion_time_s (of a success, else NaN),
     action_smoothness (mean absolute second difference of the joint targets, degrees per step squared; lower is
@@ -49,9 +49,9 @@ def evaluate(
     rows = []
     with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:
         for task in tasks:
-            for place, episode in enumerate(_episodes(actor, task, seeds, image_size, labs, bar)):
+            for episode in _episodes(actor, task, seeds, image_size, labs, bar):
                 video = save_rollout(episode, Path(videos_dir)) if videos_dir else None
-                where = {"lab": labs[place % len(labs)].name, "video": str(video) if video else None}
+                where = {"lab": _lab(labs, episode.seed).name, "video": str(video) if video else None}
                 rows.append(row(episode) | where)
     return rows
 
@@ -67,11 +67,15 @@ def _episodes(
     with closing(screen):
         for start in range(0, len(seeds), max(1, size)):
             group = seeds[start : start + size]
-            for place, env in enumerate(envs[: len(group)], start):
-                env.lab = labs[place % len(labs)]
+            for env, seed in zip(envs, group, strict=False):
+                env.lab = _lab(labs, seed)
             actors = [actor] if size == 1 else [copy(actor) for _ in group]
             yield from run_episodes(envs[: len(group)], actors, group, together)
             bar.update(len(group))
+
+
+def _lab(labs: Sequence[Lab], seed: int) -> Lab:
+    return labs[seed % len(labs)]  # by the seed, so that a seed means the same scene in whatever company it is run
 
 
 def row(episode: Episode) -> dict[str, Any]:

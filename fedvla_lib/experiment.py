@@ -1,4 +1,4 @@
-"""A grid of arms, partitions and seeds from one small file, one result file a cell, resumable.
+"""A grid of arms, partitions and seeds from one small file, one run folder a cell, resumable.
 
 ::
 
@@ -14,32 +14,33 @@
     partition = "task"
 
     [arms.fedavg]               # a kind of training, and settings of its own
-    kind = "federated"          # or base, centralized, local-only (of `client`, default 0); or clients: what each
-                                # ends with, on its own tasks
+    kind = "federated"          # or base, centralized, local-only: every client for itself, the attempts dealt out
+                                # over them; or clients: what each ends with, on its own tasks
 
     [[only]]                    # if there are any: cells that match none of them are left out
     arm = "fedavg"
     partition = "by_task"
 """
 
-import json
+import os
 import re
+import shutil
 import time
 import tomllib
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from fedvla_lib import arms, clients, data, run_folder
-from fedvla_lib.config import Config, from_profile
+from fedvla_lib import arms, clients, compare, data, run_folder, train
+from fedvla_lib.config import Config, code_digest, from_profile
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.model import Bundle
+from fedvla_lib.run_folder import GLOBAL, RunFolder
 
-KINDS = ("base", "federated", "centralized", "local-only", "clients")
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
 NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
 RULES = ("arm", "partition", "seed", "kind")  # what a rule under [[only]] may name
@@ -56,12 +57,23 @@ class Cell:
     partition: str
     seed: int
     config: Config
-    client: int = 0  # of a local-only cell
 
     @property
     def name(self) -> str:
-        """Name of the cell's file."""
+        """Name of the cell's folder."""
         return f"{self.partition}_{self.arm}_{self.seed}"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What training and evaluating a cell brought."""
+
+    rows: list[dict[str, Any]]  # the attempts
+    held_out: dict[str, float]  # averages over held-out frames, and num_examples
+    episodes: list[dict[str, float]] = field(default_factory=list)  # the same, of each held-out episode
+    rounds: list[dict[str, Any]] = field(default_factory=list)  # events of a federated run before its last round
+    bytes: int = 0  # that travelled
+    train_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -117,13 +129,13 @@ def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
         for partition, of_partition in told["partitions"].items():
             for arm, of_arm in told["arms"].items():
                 own = dict(of_arm)
-                kind, client = own.pop("kind", "federated"), own.pop("client", 0)
+                kind = own.pop("kind", "federated")
                 if bad := [name for name in (partition, arm) if not FILE_NAME.fullmatch(name)]:
                     raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
-                if kind not in KINDS:
-                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
+                if kind not in MEASURES:
+                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(MEASURES)}")
                 settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings), client)
+                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings))
 
 
 def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:
@@ -131,76 +143,126 @@ def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:
 
 
 def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print) -> None:
-    """Measure every cell that has no file in `out` yet; a file appears when its cell is complete."""
+    """Measure every cell that has no folder in `out` yet; a folder appears when its cell is complete."""
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    todo = [cell for cell in plan.cells if not (out / f"{cell.name}.json").exists()]
+    todo = [cell for cell in plan.cells if not (out / cell.name).exists()]
     say(f"{len(plan.cells)} cells, {len(plan.cells) - len(todo)} of them in {out}")
     for number, cell in enumerate(todo, 1):
         began = time.perf_counter()
-        result = measure(cell, plan.rollout_seeds)
-        run_folder.write_atomically(out / f"{cell.name}.json", (json.dumps(result) + "\n").encode())  # on one line
-        rate = sum(result["rollouts"]["success"]) / len(result["rollouts"]["success"])
+        rate = keep(cell, plan.rollout_seeds, out)
         say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {time.perf_counter() - began:.0f} s")
 
 
-def measure(cell: Cell, seeds: list[int]) -> dict[str, Any]:
-    """Train a cell's model, or find it in the cache, and return what is known of it and of its rollouts."""
-    config = with_recording(cell.config)
-    found = _of_clients(config, len(seeds)) if cell.kind == "clients" else _of_model(cell, config, seeds)
-    rows = found.pop("rows")
-    steps = {"base": 0, "local-only": arms.steps_per_client(config)}.get(cell.kind, arms.total_steps(config))
-    return {
-        "arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "seed": cell.seed,
-        "config": asdict(cell.config), "gradient_steps": steps, "samples": steps * config.batch_size, **found,
-        "stamp": run_folder.first_stamp(cell.config, cell.kind) | {"status": "completed"},
-        "rollouts": {key: [row[key] for row in rows] for key in ("task", "lab", "seed", "success", "steps")},
-    }  # fmt: skip
+def keep(cell: Cell, seeds: Sequence[int], out: Path) -> float:
+    """Measure a cell, write its run folder, whole or not at all, and return the success rate."""
+    config, began = with_recording(cell.config), time.perf_counter()
+    stamp = run_folder.first_stamp(cell.config, cell.kind)
+    found = MEASURES[cell.kind](config, seeds)
+    scratch = RunFolder(out / f".{cell.name}.{os.getpid()}")
+    shutil.rmtree(scratch.root, ignore_errors=True)
+    scratch.root.mkdir()
+    steps = 0 if cell.kind == "base" else arms.total_steps(config)
+    run_folder.write_json(scratch.root / "config.json", asdict(cell.config))
+    _log(scratch, found, 0 if cell.kind == "base" else config.num_server_rounds, steps)
+    known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "gradient_steps": steps,
+             "samples": steps * config.batch_size, "bytes": found.bytes, "train_s": found.train_s}  # fmt: skip
+    ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": code_digest(*arms.TRAINED_BY)}
+    run_folder.write_json(scratch.root / "stamp.json", stamp | ended | known)
+    os.replace(scratch.root, out / cell.name)
+    return sum(row["success"] for row in found.rows) / len(found.rows)
 
 
-def _of_model(cell: Cell, config: Config, seeds: list[int]) -> dict[str, Any]:
-    """Measure the one model that comes out of a training, on all tasks."""
+def _log(run: RunFolder, found: Measured, round_number: int, steps: int) -> None:
+    for event in found.rounds:
+        run.log(event["round"], event["who"], event["kind"], event["values"])
+    for of_episode in found.episodes:
+        run.log(round_number, GLOBAL, "held-out", of_episode)
+    for row in found.rows:
+        values = {key: row[key] for key in ("task", "lab", "seed", "success", "steps", "client") if key in row}
+        run.log(round_number, row.get("who", GLOBAL), "rollout", values)
+    run.log(round_number, GLOBAL, "evaluate", {**found.held_out, "gradient_steps": steps})
+
+
+def _base(config: Config, seeds: Sequence[int]) -> Measured:
+    return _of_model(arms.base(config), config, seeds)
+
+
+def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
     began = time.perf_counter()
-    bundle, travelled = _train(cell, config)
-    trained = time.perf_counter()
+    bundle = arms.centralized(config, progress=False)
+    return replace(_of_model(bundle, config, seeds), train_s=time.perf_counter() - began)
+
+
+def _federated(config: Config, seeds: Sequence[int]) -> Measured:
+    """Measure the last global model; what the run measured of earlier ones is kept, videos left out."""
+    folder = arms.federated(config, progress=False)
+    events = [event for event in run_folder.read_events(folder / "metrics.jsonl") if event["who"] == GLOBAL]
+    earlier = [event for event in events if event["round"] < config.num_server_rounds]
+    for event in earlier:
+        event["values"].pop("video", None)
+    return replace(
+        _of_model(arms.federated_policy(config), config, seeds),
+        rounds=[event for event in earlier if event["kind"] in ("evaluate", "rollout")],
+        bytes=_travelled(folder),
+        train_s=run_folder.read_stamp(folder)["wall_s"],
+    )
+
+
+def _travelled(folder: Path) -> int:
+    replies = run_folder.read_metrics(folder, "replies")
+    return int(replies.sent_bytes.sum() + replies.received_bytes.sum())
+
+
+def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
+    """Measure every client's own model: all held-out episodes for each, the attempts dealt out over them."""
+    each, seconds = [], 0.0
+    for client in range(config.num_clients):
+        began = time.perf_counter()
+        bundle = arms.local_only(config, client, progress=False)
+        seconds += time.perf_counter() - began
+        found = _of_model(bundle, config, seeds[client :: config.num_clients])
+        each.append(replace(found, rows=[{**row, "client": client} for row in found.rows]))
+    episodes = pd.DataFrame([of_episode for found in each for of_episode in found.episodes])
+    return Measured(
+        rows=[row for found in each for row in found.rows],
+        held_out=pd.DataFrame([found.held_out for found in each]).mean().to_dict(),
+        episodes=episodes.groupby("episode_id", as_index=False).mean().to_dict("records") if len(episodes) else [],
+        train_s=seconds,
+    )
+
+
+def _of_model(bundle: Bundle, config: Config, seeds: Sequence[int]) -> Measured:
+    """Measure one model on all held-out episodes and all tasks."""
     store = clients.open_frames(config)
-    frames, held_out = clients.validate(bundle, store, clients.held_out_episodes(store, config), config)
-    rows = clients.roll_out(bundle, config, seeds)
-    return {
-        "held_out_frames": frames, "held_out": held_out, "bytes": travelled, "rows": rows,
-        "train_s": trained - began, "evaluate_s": time.perf_counter() - trained,
-    }  # fmt: skip
+    held_out = clients.held_out_episodes(store, config)
+    frames = clients.held_out_frames(bundle, store, held_out, config)
+    episodes = clients.by_episode(frames, store, held_out) if frames else []
+    averages = {"num_examples": len(frames["loss"]), **train.average(frames)} if frames else {}
+    return Measured(clients.roll_out(bundle, config, seeds) if len(seeds) else [], averages, episodes)
 
 
-def _of_clients(config: Config, rollouts: int) -> dict[str, Any]:
+def _clients(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure what each client ends with, its own parts included, on its own tasks and held-out episodes."""
-    began = time.perf_counter()
-    run = arms.federated(replace(config, fraction_evaluate=1.0, client_rollouts=rollouts), progress=False)
+    run = arms.federated(replace(config, fraction_evaluate=1.0, client_rollouts=len(seeds)), progress=False)
     events = {kind: run_folder.read_metrics(run, kind) for kind in ("rollout", "evaluate", "replies")}
-    own = {kind: of_kind[of_kind.who != run_folder.GLOBAL] for kind, of_kind in events.items()}
+    own = {kind: of_kind[of_kind.who != GLOBAL] for kind, of_kind in events.items()}
     last = own["evaluate"][own["evaluate"]["round"] == config.num_server_rounds]
     last = last[last.num_examples > 0]
     training = events["replies"][events["replies"]["to"] == "train"]
-    return {
-        "held_out_frames": int(last.num_examples.sum()),
-        "held_out": {"loss": float(np.average(last.loss, weights=last.num_examples))},
-        "bytes": int(training.sent_bytes.sum() + training.received_bytes.sum()),
-        "rows": own["rollout"].to_dict("records"),
-        "train_s": time.perf_counter() - began, "evaluate_s": 0.0,
-    }  # fmt: skip
+    return Measured(
+        rows=own["rollout"].to_dict("records"),
+        held_out={"num_examples": int(last.num_examples.sum()),
+                  "loss": float(np.average(last.loss, weights=last.num_examples))},
+        bytes=int(training.sent_bytes.sum() + training.received_bytes.sum()),
+        train_s=run_folder.read_stamp(run)["wall_s"],
+    )  # fmt: skip
 
 
-def _train(cell: Cell, config: Config) -> tuple[Bundle, int]:
-    """Return the model of a cell and the bytes that travelled for its training."""
-    if cell.kind == "federated":
-        folder = arms.federated(config, progress=False)
-        replies = run_folder.read_metrics(folder, "replies")
-        return arms.federated_policy(config), int(replies.sent_bytes.sum() + replies.received_bytes.sum())
-    if cell.kind == "centralized":
-        return arms.centralized(config, progress=False), 0
-    if cell.kind == "local-only":
-        return arms.local_only(config, cell.client, progress=False), 0
-    return arms.base(config), 0
+MEASURES = {
+    "base": _base, "federated": _federated, "centralized": _centralized, "local-only": _local_only,
+    "clients": _clients,
+}  # fmt: skip
 
 
 def with_recording(config: Config) -> Config:
@@ -209,18 +271,39 @@ def with_recording(config: Config) -> Config:
 
 
 def read_results(folder: Path) -> pd.DataFrame:
-    """Return a row for each rollout of each cell in `folder`, with what is known of the cell.
+    """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
 
     Raises:
         ValueError: there is no result.
     """
-    files = sorted(Path(folder).glob("*.json"))
-    if not files:
+    cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
+    if not cells:
         raise ValueError(f"no results in {folder}: make some with fedvla experiment")
-    tables = []
-    for file in files:
-        cell = json.loads(file.read_text())
-        known = {key: cell[key] for key in ("arm", "kind", "partition", "gradient_steps", "bytes", "train_s")}
-        known |= {"run": cell["seed"], "loss": cell["held_out"].get("loss")}
-        tables.append(pd.DataFrame(cell["rollouts"]).assign(**known))
-    return pd.concat(tables, ignore_index=True)
+    return pd.concat([_attempts(cell) for cell in cells], ignore_index=True)
+
+
+def _attempts(cell: Path) -> pd.DataFrame:
+    stamp = run_folder.read_stamp(cell)
+    known = {key: stamp[key] for key in ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")}
+    rows = run_folder.read_metrics(cell, "rollout")
+    last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
+    return rows[rows["round"] == last["round"]].assign(**known, run=stamp["seed"], loss=last.get("loss"))
+
+
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a line for each partition and arm: seeds, attempts, success with its interval, and what training took.
+
+    Args:
+        rows: of `read_results`.
+    """
+    lines = []
+    for (partition, arm), part in rows.groupby(["partition", "arm"], sort=False):
+        cells = part.groupby("run").first()
+        low, high = compare.success_interval(part)
+        lines.append({
+            "partition": partition, "arm": arm, "seeds": len(cells), "attempts": len(part),
+            "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
+            "gradient_steps": cells.gradient_steps.mean(), "samples": cells.samples.mean(),
+            "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
+        })  # fmt: skip
+    return pd.DataFrame(lines)

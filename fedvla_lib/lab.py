@@ -35,8 +35,12 @@ class Lab:
 REFERENCE = Lab()
 
 
-def labs(count: int, seed: int) -> list[Lab]:
-    """Return the laboratories of a run: the reference, then others; lab k is the same however many there are."""
+def labs(count: int, seed: int = 0) -> list[Lab]:
+    """Return laboratories: the reference, then others; lab k is the same however many there are.
+
+    Runs leave `seed` at 0, so that a recording and whoever trains on it later, with seeds of their own, mean the same
+    places.
+    """
     return [REFERENCE, *(draw_lab(f"lab_{k}", np.random.default_rng([seed, k])) for k in range(1, count))]
 
 

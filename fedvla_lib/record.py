@@ -164,7 +164,7 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
     done = _num_recorded(root)
     size, jitter = settings["image_size"], settings["jitter"]
     envs = {task: So100Env(task, size, jitter=jitter) for task in dict.fromkeys(settings["tasks"])}
-    places = labs(settings["num_labs"], settings["seed"])
+    places = labs(settings["num_labs"])
     bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
     recorder = _Recorder(root, settings, done)
     try:

@@ -71,8 +71,9 @@ def federate(
     check_tasks(task_names(config))
     before = _before(config, run, states)
     store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
-    members, weights, stats = _introduce(grid, config, run)
-    bundle = model.load_policy(config, stats)
+    members, weights, pooled = _introduce(grid, config, run)
+    stats = clients.common_statistics(config, pooled)
+    bundle = model.load_policy(config, clients.judging_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
     if before:  # in the order of the model, which is not that of the file
         arrays, done = {name: before.arrays[name] for name in arrays}, before.round

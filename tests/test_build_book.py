@@ -54,7 +54,7 @@ def test_key_changes_with_everything_a_chapter_depends_on(project):
 
 @pytest.mark.unit
 def test_key_changes_with_the_stored_results_that_a_chapter_reads(project):
-    stored = project / "book" / "reference" / "runs"
+    stored = project / "book" / "reference" / "runs" / "task_fedavg_0"
     stored.mkdir(parents=True)
     (stored / "a.json").write_text("1")
     notebook = project / "notebooks" / "one.ipynb"

@@ -6,6 +6,7 @@ from math import comb, sqrt
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from fedvla_lib import compare
 
@@ -121,3 +122,75 @@ def test_the_paired_interval_covers_a_known_difference(truth):
         found = compare.success_difference(left, right, seed=k)
         covered += found["low"] <= truth <= found["high"]
     assert 0.92 <= covered / 300 <= 0.98
+
+
+def outcomes(values, tasks=2):
+    """A line for each training seed, a column for each attempt, half of them at each task."""
+    values = np.asarray(values, float)
+    columns = [(f"task {k * tasks // values.shape[1]}", k) for k in range(values.shape[1])]
+    return pd.DataFrame(values, columns=pd.MultiIndex.from_tuples(columns, names=["task", "seed"]))
+
+
+def test_with_one_attempt_a_seed_the_interval_is_students():
+    each = np.array([0.1, 0.4, 0.3, 0.25, 0.6])
+    found = compare.over_seeds(outcomes(each[:, None], tasks=1))
+    expected = stats.ttest_1samp(each, 0)
+    assert found["p_value"] == pytest.approx(expected.pvalue) and found["df"] == 4
+    assert (found["low"], found["high"]) == pytest.approx(tuple(expected.confidence_interval()))
+
+
+def test_the_parts_of_the_variance_are_those_of_a_case_worked_out_by_hand():
+    # Four seeds, two attempts at one task: seeds are off the mean by 0.5, 0.5, 0 and 0, attempts by 0.
+    found = compare.over_seeds(outcomes([[1, 1], [0, 0], [1, 0], [0, 1]], tasks=1))
+    # Sums of squares: seeds 2 (0.25 + 0.25), attempts 0, rest 4 x 0.25. Mean squares: 1/3, 0, 1/3.
+    # Their sum MS_seeds + MS_attempts - MS_rest is 0, so half the rest counts, with the seeds' degrees of freedom.
+    reach = stats.t.ppf(0.975, 3) * sqrt(1 / 6 / 8)
+    assert (found["low"], found["high"]) == pytest.approx((0.5 - reach, 0.5 + reach))
+
+
+def test_several_attempts_need_several_training_seeds():
+    with pytest.raises(ValueError, match="at least 2"):
+        compare.over_seeds(outcomes([[1, 0, 1, 1]]))
+
+
+@pytest.mark.parametrize(("of_seeds", "of_attempts"), [(0, 0), (0, 1), (0.1, 0.5), (0.3, 0.5)])
+def test_intervals_over_seeds_and_attempts_cover_the_truth_as_often_as_they_say(of_seeds, of_attempts):
+    """Two arms of known success: 5 training seeds x 2 tasks x 50 attempts, simulated 800 times."""
+    rng, covered, seeds, easy = np.random.default_rng(7), 0, 5, np.repeat([1.0, 0.3], 50)
+    spread = sqrt(1 + of_seeds**2 + of_attempts**2)
+    truth = (stats.norm.cdf(np.array([1.0, 0.3]) / spread) - stats.norm.cdf(np.array([0.7, 0.0]) / spread)).mean()
+    for _ in range(800):
+        shared = of_attempts * rng.normal(size=100)  # an attempt that is hard is hard for both arms
+        left, right = (
+            easy - shift + shared + of_seeds * rng.normal(size=(seeds, 1)) + rng.normal(size=(seeds, 100)) > 0
+            for shift in (0.0, 0.3)
+        )
+        found = compare.over_seeds(outcomes(left.astype(float) - right))
+        covered += found["low"] <= truth <= found["high"]
+    assert 0.93 <= covered / 800 <= 0.97
+
+
+def test_arms_are_paired_by_training_seed_and_attempt():
+    arms = {"a": [[1, 1, 1, 0], [1, 1, 0, 1]], "b": [[1, 0, 1, 0], [0, 1, 0, 1]]}
+    lines = [
+        {"arm": arm, "run": run, "task": "lift", "seed": seed, "success": ok}
+        for arm, each in arms.items() for run, outcome in enumerate(each) for seed, ok in enumerate(outcome)
+    ]  # fmt: skip
+    table = pd.DataFrame(lines)
+    found = compare.difference_over_seeds(table, "a", "b", seed=0)
+    assert found["difference"] == pytest.approx(0.25) and (found["only_left"], found["only_right"]) == (2, 0)
+    assert found["mcnemar_p"] == pytest.approx(0.5) and found["low"] < 0.25 < found["high"]
+    assert found["boot_low"] <= 0.25 <= found["boot_high"]
+    with pytest.raises(ValueError, match="cannot be paired"):
+        compare.difference_over_seeds(table.drop(index=[3, 7]), "a", "b", seed=0)
+    with pytest.raises(ValueError, match="lack attempts"):
+        compare.by_run(table[table.arm == "a"].drop(index=3))
+    with pytest.raises(ValueError, match="twice"):
+        compare.by_run(table)
+
+
+def test_the_crossed_bootstrap_is_as_wide_as_the_spread_of_seeds_when_only_they_differ():
+    each = np.array([0.0, 0.2, 0.4, 0.6, 0.8])
+    low, high = compare.crossed_bootstrap(outcomes(np.repeat(each[:, None], 10, axis=1)), seed=0, resamples=20_000)
+    draws = np.random.default_rng(1).choice(each, (20_000, 5)).mean(axis=1)
+    assert (low, high) == pytest.approx(tuple(np.quantile(draws, [0.025, 0.975])), abs=0.021)

@@ -5,8 +5,9 @@ import tomllib
 
 import pytest
 
-from fedvla_lib import arms, experiment
+from fedvla_lib import arms, clients, experiment, run_folder
 from fedvla_lib.cli import main
+from fedvla_lib.config import from_profile
 
 GRID = """
 profile = "tiny"
@@ -94,10 +95,11 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     file.write_text("\n".join(lines))
     plan = experiment.read_plan(file)
     experiment.run_plan(experiment.Plan(plan.cells[:2], plan.rollout_seeds), out)
-    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    before = {path.name: (path / "stamp.json").stat().st_mtime_ns for path in out.iterdir()}
     assert main(["experiment", str(file), "--out", str(out)]) == 0
-    assert "5 cells, 2 of them in" in capsys.readouterr().out
-    assert all((out / name).stat().st_mtime_ns == time for name, time in before.items())
+    said = capsys.readouterr().out
+    assert "5 cells, 2 of them in" in said and "gradient_steps" in said  # a table at the end shows what each arm spent
+    assert all((out / name / "stamp.json").stat().st_mtime_ns == time for name, time in before.items())
 
     rows = experiment.read_results(out)
     each, rows = rows[rows.arm == "each"], rows[rows.arm != "each"]
@@ -106,11 +108,41 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     pairs = rows.groupby("arm")[["task", "seed"]].apply(lambda part: sorted(map(tuple, part.values)))
     assert all(pair == pairs.iloc[0] for pair in pairs)  # every arm made the same attempts
     steps = rows.groupby("arm").gradient_steps.first()
-    assert steps["start"] == 0 and steps["averaged"] == steps["pooled"] == 2 * steps["alone"]
+    assert steps["start"] == 0 and steps["averaged"] == steps["pooled"] == steps["alone"]
     travelled = rows.groupby("arm").bytes.first()
     assert travelled["averaged"] > 1e6 and travelled["pooled"] == travelled["start"] == 0
     assert rows.groupby("arm").loss.first().nunique() == 4
-    cell = json.loads((out / "mixed_averaged_0.json").read_text())
-    assert cell["stamp"]["status"] == "completed" and cell["stamp"]["commit"]
+    stamp = run_folder.read_stamp(out / "mixed_averaged_0")
+    assert stamp["status"] == "completed" and stamp["commit"] and stamp["code"] and stamp["wall_s"] > 0
+    alone = run_folder.read_metrics(out / "mixed_alone_0", "rollout")
+    assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
         experiment.read_results(tmp_path / "nowhere")
+
+
+@pytest.mark.integration
+def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tmp_path, capsys):
+    lines = ["profile = 'tiny'", "seeds = [0]", "rollouts = 2", "[settings]", f"data = {json.dumps(str(recording))}",
+             "tasks = 'lift,push'", "num_clients = 2", "[partitions.mixed]", "[arms.averaged]", "eval_every = 1",
+             "eval_rollouts = 1", "[arms.pooled]", "kind = 'centralized'"]  # fmt: skip
+    file, out = tmp_path / "grid.toml", tmp_path / "out"
+    file.write_text("\n".join(lines))
+    assert main(["experiment", str(file), "--out", str(out)]) == 0
+    rounds = run_folder.read_metrics(out / "mixed_averaged_0", "evaluate")
+    assert list(rounds["round"]) == [0, 1, 2] and rounds.success_rate[:2].notna().all() and rounds.loss.notna().all()
+    cells = [str(out / name) for name in ("mixed_pooled_0", "mixed_averaged_0")]
+    assert main(["compare", *cells, "--out", str(tmp_path / "compared")]) == 0
+    assert "success_rate" in capsys.readouterr().out
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("choice", ["own", "held-out", "none"])
+def test_a_wrong_choice_of_statistics_changes_the_model_or_how_it_acts(choice, recording):
+    settings = {"tasks": "lift,push", "data": str(recording), "partition": "task", "num_clients": 2}
+    right, wrong = from_profile("tiny", **settings), from_profile("tiny", **settings, normalisation=choice)
+    trained, other = (arms.federated_policy(config) for config in (right, wrong))
+    same = all((trained.shared_arrays()[name] == other.shared_arrays()[name]).all() for name in trained.shared_arrays())
+    assert same == (choice == "held-out")  # the last leaves training as it is, and reads its result wrongly
+    store = clients.open_frames(right)
+    ids = clients.held_out_episodes(store, right)
+    assert clients.validate(trained, store, ids, right) != clients.validate(other, store, ids, right)
