@@ -290,18 +290,19 @@ def _attempts(cell: Path) -> pd.DataFrame:
     return rows[rows["round"] == last["round"]].assign(**known, run=stamp["seed"], loss=last.get("loss"))
 
 
-def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line for each partition and arm: seeds, attempts, success with its interval, and what training took.
+def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
+    """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
 
     Args:
         rows: of `read_results`.
+        by: columns that make a group; at least partition and arm.
     """
     lines = []
-    for (partition, arm), part in rows.groupby(["partition", "arm"], sort=False):
+    for group, part in rows.groupby(list(by), sort=False):
         cells = part.groupby("run").first()
         low, high = compare.success_interval(part)
         lines.append({
-            "partition": partition, "arm": arm, "seeds": len(cells), "attempts": len(part),
+            **dict(zip(by, group, strict=True)), "seeds": len(cells), "attempts": len(part),
             "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
             "gradient_steps": cells.gradient_steps.mean(), "samples": cells.samples.mean(),
             "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),

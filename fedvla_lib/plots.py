@@ -123,7 +123,7 @@ def trends(table: pd.DataFrame, labels: dict[str, str]) -> Sequence[Axes]:
 
 
 def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success rates with Wilson intervals; columns arm, task, success_rate, low, high."""
+    """Draw success rates with their intervals; columns arm, task, success_rate, low, high."""
     ax = ax or _new_axes()
     arms, tasks = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.task))
     width = 0.8 / len(arms)
@@ -136,7 +136,7 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xticks(range(len(tasks)), tasks)
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("task")
-    ax.set_ylabel("success rate (95 % Wilson interval)")
+    ax.set_ylabel("success rate (95 % interval)")
     ax.legend(frameon=False, ncols=len(arms), loc="upper center", bbox_to_anchor=(0.5, 1.14))
     return ax
 
@@ -607,7 +607,7 @@ def success_intervals(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_yticks(range(len(arms)), arms)
     ax.invert_yaxis()
     ax.set_xlim(-2, 102)
-    ax.set_xlabel("success rate [%], 95 % Wilson interval")
+    ax.set_xlabel("success rate [%], 95 % interval")
     ax.set_ylabel("strategy")
     ax.legend(frameon=False, ncols=len(partitions), loc="lower center", bbox_to_anchor=(0.5, 1.0), title="partition")
     return ax
