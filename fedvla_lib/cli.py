@@ -440,7 +440,8 @@ def _engine(name: str) -> Callable[[Config], Path]:
 
 def experiment(options: argparse.Namespace) -> None:
     """Measure every cell of an experiment that has no result yet."""
-    from fedvla_lib.experiment import read_plan, read_results, run_plan, summary
+    from fedvla_lib.experiment import read_plan, run_plan
+    from fedvla_lib.results import read_results, summary
 
     run_plan(read_plan(options.file), options.out)
     print(summary(read_results(options.out)).round(3).to_string(index=False))

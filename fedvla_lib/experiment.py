@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fedvla_lib import arms, clients, compare, data, run_folder, train
+from fedvla_lib import arms, clients, data, run_folder, train
 from fedvla_lib.config import Config, code_digest, from_profile
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.model import Bundle
@@ -268,43 +268,3 @@ MEASURES = {
 def with_recording(config: Config) -> Config:
     """Return settings that name the recording: one for all seeds, since a run's seed fixes training alone."""
     return config if config.data else replace(config, data=str(data.resolve(replace(config, seed=0))))
-
-
-def read_results(folder: Path) -> pd.DataFrame:
-    """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
-
-    Raises:
-        ValueError: there is no result.
-    """
-    cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
-    if not cells:
-        raise ValueError(f"no results in {folder}: make some with fedvla experiment")
-    return pd.concat([_attempts(cell) for cell in cells], ignore_index=True)
-
-
-def _attempts(cell: Path) -> pd.DataFrame:
-    stamp = run_folder.read_stamp(cell)
-    known = {key: stamp[key] for key in ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")}
-    rows = run_folder.read_metrics(cell, "rollout")
-    last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
-    return rows[rows["round"] == last["round"]].assign(**known, run=stamp["seed"], loss=last.get("loss"))
-
-
-def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
-    """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
-
-    Args:
-        rows: of `read_results`.
-        by: columns that make a group; at least partition and arm.
-    """
-    lines = []
-    for group, part in rows.groupby(list(by), sort=False):
-        cells = part.groupby("run").first()
-        low, high = compare.success_interval(part)
-        lines.append({
-            **dict(zip(by, group, strict=True)), "seeds": len(cells), "attempts": len(part),
-            "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
-            "gradient_steps": cells.gradient_steps.mean(), "samples": cells.samples.mean(),
-            "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
-        })  # fmt: skip
-    return pd.DataFrame(lines)

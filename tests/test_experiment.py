@@ -3,9 +3,11 @@
 import json
 import tomllib
 
+import numpy as np
+import pandas as pd
 import pytest
 
-from fedvla_lib import arms, clients, experiment, run_folder
+from fedvla_lib import arms, clients, experiment, results, run_folder
 from fedvla_lib.cli import main
 from fedvla_lib.config import from_profile
 
@@ -101,7 +103,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     assert "5 cells, 2 of them in" in said and "gradient_steps" in said  # a table at the end shows what each arm spent
     assert all((out / name / "stamp.json").stat().st_mtime_ns == time for name, time in before.items())
 
-    rows = experiment.read_results(out)
+    rows = results.read_results(out)
     each, rows = rows[rows.arm == "each"], rows[rows.arm != "each"]
     assert set(rows.arm) == {"start", "averaged", "pooled", "alone"} and len(rows) == 4 * 2 * 2
     assert len(each) == 2 * 2 and each.loss.notna().all()  # of every client its own attempts
@@ -117,7 +119,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     alone = run_folder.read_metrics(out / "mixed_alone_0", "rollout")
     assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
-        experiment.read_results(tmp_path / "nowhere")
+        results.read_results(tmp_path / "nowhere")
 
 
 @pytest.mark.integration
@@ -129,6 +131,8 @@ def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tm
     file.write_text("\n".join(lines))
     assert main(["experiment", str(file), "--out", str(out)]) == 0
     rounds = run_folder.read_metrics(out / "mixed_averaged_0", "evaluate")
+    curve = results.read_rounds(out)
+    assert list(curve["round"]) == [0, 1, 2] and list(curve.n) == [2, 2, 4] and curve.steps.iloc[-1] == 8
     assert list(rounds["round"]) == [0, 1, 2] and rounds.success_rate[:2].notna().all() and rounds.loss.notna().all()
     cells = [str(out / name) for name in ("mixed_pooled_0", "mixed_averaged_0")]
     assert main(["compare", *cells, "--out", str(tmp_path / "compared")]) == 0
@@ -146,3 +150,19 @@ def test_a_wrong_choice_of_statistics_changes_the_model_or_how_it_acts(choice, r
     store = clients.open_frames(right)
     ids = clients.held_out_episodes(store, right)
     assert clients.validate(trained, store, ids, right) != clients.validate(other, store, ids, right)
+
+
+@pytest.mark.unit
+def test_differences_use_the_seeds_that_both_arms_have_and_are_corrected_together():
+    rng = np.random.default_rng(0)
+    lines = [
+        {"partition": partition, "arm": arm, "run": run, "task": "lift", "seed": seed, "loss": 0.1 * rate + 0.01 * run,
+         "success": rng.random() < rate}
+        for partition in ("iid", "task") for arm, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
+        for seed in range(40) if not (arm == "shared" and run == 3)
+    ]  # fmt: skip
+    found = results.differences(pd.DataFrame(lines), [("shared", "pooled")], seed=0)
+    assert list(found.partition) == ["iid", "task"] and list(found.seeds) == [3, 3] and list(found.n) == [120, 120]
+    assert (found.high < 0).all() and (found.p_holm >= found.p_value).all()
+    assert found.loss.tolist() == pytest.approx([-0.04, -0.04])
+    assert (found.loss_low <= found.loss).all() and (found.loss <= found.loss_high).all()

@@ -1,0 +1,104 @@
+"""What an experiment left on disk -> tables: every attempt, every measured round, arms, differences of arms."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from fedvla_lib import compare, run_folder
+
+OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
+
+
+def read_results(folder: Path) -> pd.DataFrame:
+    """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
+
+    Raises:
+        ValueError: there is no result.
+    """
+    return pd.concat([_attempts(cell) for cell in _cells(folder)], ignore_index=True)
+
+
+def _cells(folder: Path) -> Iterator[Path]:
+    cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
+    if not cells:
+        raise ValueError(f"no results in {folder}: make some with fedvla experiment")
+    yield from cells
+
+
+def _known(cell: Path) -> dict[str, Any]:
+    stamp = run_folder.read_stamp(cell)
+    return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"]}
+
+
+def _attempts(cell: Path) -> pd.DataFrame:
+    rows = run_folder.read_metrics(cell, "rollout")
+    last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
+    measured = {name: float(last.get(name, "nan")) for name in ("loss", "action_error")}
+    return rows[rows["round"] == last["round"]].assign(**_known(cell), **measured)
+
+
+def read_rounds(folder: Path) -> pd.DataFrame:
+    """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
+
+    Columns: partition, arm, run, round, steps (gradient steps of all clients up to there), loss, action_error, n,
+    successes, success_rate. Rounds that made no attempt have n = 0 and no rate.
+    """
+    tables = []
+    for cell in _cells(folder):
+        known = _known(cell)
+        if known["kind"] == "federated":
+            measured = run_folder.read_metrics(cell, "evaluate").set_index("round")[["loss", "action_error"]]
+            made = run_folder.read_metrics(cell, "rollout").groupby("round").success.agg(n="size", successes="sum")
+            rounds = measured.join(made).fillna({"n": 0, "successes": 0}).astype({"n": int, "successes": int})
+            steps = known["gradient_steps"] * rounds.index / rounds.index.max()
+            named = {key: known[key] for key in ("partition", "arm", "run")}
+            tables.append(rounds.assign(**named, steps=steps.astype(int)).reset_index())
+    table = pd.concat(tables, ignore_index=True)
+    return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
+
+
+def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
+    """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
+
+    Args:
+        rows: of `read_results`.
+        by: columns that make a group; at least partition and arm.
+    """
+    lines = []
+    for group, part in rows.groupby(list(by), sort=False):
+        cells = part.groupby("run").first()
+        low, high = compare.success_interval(part)
+        lines.append({
+            **dict(zip(by, group, strict=True)), "seeds": len(cells), "attempts": len(part),
+            "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
+            "action_error": cells.action_error.mean(),
+            "gradient_steps": cells.gradient_steps.mean(), "samples": cells.samples.mean(),
+            "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
+    """Return a line for each partition and pair of arms that both have: `compare.difference_over_seeds` of success.
+
+    Only training seeds that both arms have are used. `loss` is the difference of held-out losses with loss_low and
+    loss_high, Student's over training seeds. The p-values of the table are one family; `p_holm` are Holm's (1979).
+    """
+    lines = []
+    for partition, part in rows.groupby("partition", sort=False):
+        for arm, other in pairs:
+            shared = set(part[part.arm == arm].run) & set(part[part.arm == other].run)
+            if len(shared) > 1:
+                both = part[part.run.isin(shared)]
+                found = compare.difference_over_seeds(both, arm, other, seed=seed)
+                lines.append({"partition": partition, "seeds": len(shared), **found, **_of_losses(both, arm, other)})
+    table = pd.DataFrame(lines)
+    return table.assign(p_holm=compare.holm(table.p_value)) if lines else table
+
+
+def _of_losses(rows: pd.DataFrame, arm: str, other: str) -> dict[str, float]:
+    losses = rows.groupby(["arm", "run"]).loss.first()
+    found = compare.over_seeds((losses[arm] - losses[other]).to_frame())
+    return {"loss": found["difference"], "loss_low": found["low"], "loss_high": found["high"]}
