@@ -90,10 +90,10 @@ def _kept(config: Config, name: str, train: Callable[[], model.Bundle]) -> model
 
 
 def _everything(config: Config) -> Client:
-    """One client that holds every training episode."""
+    """One client with every training episode and client 0's random stream: of one client, all arms learn the same."""
     store = clients.open_frames(config)
     train_ids, val_ids = data.split(store, config.val_fraction, config.seed)
-    return Client(config, config.num_clients, store, Share(train_ids, val_ids))
+    return Client(config, 0, store, Share(train_ids, val_ids))
 
 
 def _pooled_stats(config: Config) -> str:

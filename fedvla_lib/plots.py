@@ -535,7 +535,8 @@ def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
 
 def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw differences in success rate with their intervals, a line each; columns arm, other, difference, low, high."""
-    ax = ax or _new_axes()
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, max(3.6, 1.2 + 0.4 * len(table))), layout="constrained")
     places = np.arange(len(table))
     errors = np.abs(np.stack([table.difference - table.low, table.high - table.difference]))
     ax.errorbar(100 * table.difference, places, xerr=100 * errors, fmt="o", capsize=4, color=PALETTE[0])
@@ -544,7 +545,7 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xlim(-reach, reach)
     ax.set_yticks(places, table.arm + " − " + table.other)
     ax.set_ylim(len(table) - 0.5, -0.5)
-    ax.set_xlabel("difference in success rate [points], 95 % bootstrap interval")
+    ax.set_xlabel("difference in success rate [points], 95 % interval")
     ax.set_ylabel("pair of arms")
     return ax
 
@@ -626,4 +627,38 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xlabel("everything that travelled [MB]")
     ax.set_ylabel("success rate [%], 95 % Wilson interval")
     ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    return ax
+
+
+def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw held-out loss and success against gradient steps, an arm a colour: mean and range over training seeds.
+
+    Args:
+        rounds: columns arm, run, steps, loss, success_rate.
+    """
+    if axes is None:
+        _, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.4), layout="constrained")
+    for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
+        for ax, value in zip(axes, ("loss", "success_rate"), strict=True):
+            over = part.groupby("steps")[value].agg(["mean", "min", "max"])
+            ax.plot(over.index, over["mean"], "o-", color=PALETTE[i % len(PALETTE)], label=arm)
+            ax.fill_between(over.index, over["min"], over["max"], color=PALETTE[i % len(PALETTE)], alpha=0.15)
+            ax.set_xlabel("gradient steps of all clients")
+    axes[0].set_ylabel("held-out loss [normalised units²]")
+    axes[0].set_yscale("log")
+    axes[1].set_ylabel("success rate")
+    axes[1].set_ylim(-0.02, 1.02)
+    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside upper center")
+    return axes
+
+
+def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw one point a checkpoint: held-out loss across, success rate up, an arm a colour; columns as above."""
+    ax = ax or _new_axes()
+    for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
+        ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=PALETTE[i % len(PALETTE)], label=arm)
+    ax.set_ylim(-0.02, 1.02)
+    ax.set_xlabel("held-out loss [normalised units²]")
+    ax.set_ylabel("success rate")
+    ax.legend(frameon=False)
     return ax

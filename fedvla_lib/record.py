@@ -97,6 +97,11 @@ def features(image_size: int, num_labs: int = 1) -> dict[str, dict[str, Any]]:
     return {STATE_KEY: joints, ACTION_KEY: dict(joints), **videos, **lab}
 
 
+def demonstration_seed(seed: int, index: int, attempt: int) -> int:
+    """Return the seed of the scene in which episode `index` of a recording is tried for the `attempt`-th time."""
+    return int(np.random.SeedSequence([seed, index, attempt]).generate_state(1)[0])
+
+
 def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
     """Return a successful expert episode of `env`'s task; a pure function of the task, `index` and `seed`.
 
@@ -104,8 +109,7 @@ def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
         RuntimeError: the expert failed with `MAX_ATTEMPTS` seeds in a row.
     """
     for attempt in range(MAX_ATTEMPTS):
-        episode_seed = int(np.random.SeedSequence([seed, index, attempt]).generate_state(1)[0])
-        episode = run_episode(env, Expert(), episode_seed)
+        episode = run_episode(env, Expert(), demonstration_seed(seed, index, attempt))
         if episode.success:
             return episode
     raise RuntimeError(f"the expert failed at task {env.task!r}, episode {index}, with {MAX_ATTEMPTS} seeds in a row")

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,7 +10,12 @@ import pytest
 
 from fedvla_lib import arms, clients, experiment, results, run_folder
 from fedvla_lib.cli import main
-from fedvla_lib.config import from_profile
+from fedvla_lib.clients import CLIENT_SEEDS
+from fedvla_lib.config import from_profile, task_names
+from fedvla_lib.evaluate import FIRST_SEED
+from fedvla_lib.record import MAX_ATTEMPTS, demonstration_seed
+
+REFERENCE = Path(__file__).parents[1] / "book" / "reference"
 
 GRID = """
 profile = "tiny"
@@ -120,6 +126,17 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
         results.read_results(tmp_path / "nowhere")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("file", sorted({*REFERENCE.glob("*.toml")} - {REFERENCE / "notes.toml"}), ids=lambda f: f.stem)
+def test_attempts_start_where_no_demonstration_and_no_look_during_training_did(file):
+    plan = experiment.read_plan(file)
+    config = plan.cells[0].config
+    episodes = range(config.episodes_per_task * len(task_names(config)))
+    shown = {demonstration_seed(0, index, attempt) for index in episodes for attempt in range(MAX_ATTEMPTS)}
+    during_training = range(FIRST_SEED, FIRST_SEED + CLIENT_SEEDS * (config.num_clients + 1))
+    assert not set(plan.rollout_seeds) & (shown | set(during_training))
 
 
 @pytest.mark.integration

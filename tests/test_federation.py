@@ -12,7 +12,7 @@ from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from safetensors.numpy import load_file
 
-from fedvla_lib import client_app, clients, data, engine, model, run_folder, train, wire
+from fedvla_lib import arms, client_app, clients, data, engine, model, run_folder, train, wire
 from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile
 from fedvla_lib.evaluate import read_video
 from fedvla_lib.params import digest, layer_of, shapes_of, trainable_arrays
@@ -59,6 +59,19 @@ def test_one_client_averaging_equals_local_training_bit_for_bit(tiny, rank, tmp_
         train.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
     model.save_policy(bundle, tmp_path / "local")  # with adapters added in
     assert same(federated, load_file(tmp_path / "local" / "model.safetensors"))
+
+
+def test_of_one_client_a_full_batch_and_one_step_federated_and_centralized_are_alike(tiny):
+    whole = clients.open_client(replace(tiny, num_clients=1), 0).num_examples
+    single = {"num_clients": 1, "num_server_rounds": 1, "local_steps": 1, "warmup_steps": 0}
+    config = replace(tiny, **single, batch_size=whole, **NO_ROLLOUTS)
+    start, federated, centralized = (
+        bundle.shared_arrays()
+        for bundle in (arms.base(config), arms.federated_policy(config), arms.centralized(config, progress=False))
+    )
+    assert any(np.abs(federated[name] - start[name]).max() > 1e-5 for name in start)
+    for name in start:
+        np.testing.assert_allclose(federated[name], centralized[name], rtol=0, atol=1e-6)
 
 
 def test_two_runs_with_one_seed_agree_bit_for_bit(tiny):

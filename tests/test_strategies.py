@@ -114,6 +114,15 @@ def test_the_result_does_not_depend_on_who_answers_first():
     assert dict(forward_metrics) == dict(backward_metrics)
 
 
+def test_it_does_not_matter_which_client_is_called_what():
+    def called(names):
+        return answering(lambda k, _: reply_content(random_arrays(names[k]), 3 + 7 * names[k]))
+
+    (straight, _, _), (shuffled, _, _) = (one_round(called(names), 5) for names in (range(5), [3, 1, 4, 0, 2]))
+    for name in SHAPES:
+        np.testing.assert_allclose(straight[name], shuffled[name], rtol=1e-6, atol=1e-7)
+
+
 def test_twice_the_examples_count_as_being_there_twice():
     once, _, _ = one_round(answering(lambda k, _: reply_content(random_arrays(k), examples=[10, 20][k])), 2)
     twice, _, _ = one_round(answering(lambda k, _: reply_content(random_arrays([0, 1, 1][k]), examples=10)), 3)
