@@ -1,13 +1,14 @@
 # make book   build the book: environment, data, every chapter, HTML      make doctor  what is missing on this machine
 # make test   run everything that guards it                               make lab     open the notebooks
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
+# make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
 # Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv).
 .DEFAULT_GOAL := help
-.PHONY: help env book data doctor test lint lab lock clean
+.PHONY: help env book check-site data doctor test lint lab lock new-chapter clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -44,7 +45,7 @@ export MUJOCO_GL ?= egl
 endif
 
 help:
-	@sed -n '1,8s/^# \{0,1\}//p' Makefile
+	@sed -n '1,9s/^# \{0,1\}//p' Makefile
 
 env: $(STAMP)
 
@@ -80,6 +81,13 @@ data: $(STAMP)
 # Records the demonstrations first, unless no chapter has to be executed.
 book: doctor
 	$(BIN)/python book/build_book.py --profile $(FEDVLA_PROFILE)
+
+# Every page of the rendered book, in the system's Chromium.
+check-site: $(STAMP)
+	$(BIN)/python book/check_site.py _build/html/$(FEDVLA_PROFILE)
+
+new-chapter: $(STAMP)
+	@$(BIN)/python book/new_chapter.py "$(NAME)"
 
 lab: $(STAMP)
 	cd notebooks && ../$(BIN)/jupyter lab

@@ -17,13 +17,14 @@ import uuid
 from datetime import datetime
 from pathlib import Path
 
+import pandas as pd
 import psutil
 from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from report import laptop, options, report, start
 
 from fedvla_lib import data, engine, superlink
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, task_names
 from fedvla_lib.run_folder import GLOBAL, read_events
 
 MARK = "FEDVLA_BENCHMARK"  # in the environment of every process of one measurement
@@ -45,9 +46,9 @@ def main() -> None:
         return
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        episodes = repeated(laptop(chosen.profile), max(chosen.clients), Path(folder))
-        for name in chosen.engines:
-            for count in chosen.clients:
+        for count in chosen.clients:
+            episodes = repeated(laptop(chosen.profile), count, Path(folder) / f"for_{count}")
+            for name in chosen.engines:
                 settings = light(episodes, count, chosen.rounds, Path(folder) / f"{name}_{count}")
                 rows.append({"engine": name, "clients": count, **measure({"engine": name, **settings}, chosen.profile)})
                 print(rows[-1], flush=True)
@@ -57,21 +58,34 @@ def main() -> None:
 def repeated(config: Config, count: int, folder: Path) -> Path:
     """Write a data set that repeats the profile's recording until `count` clients have an episode to train on."""
     path, k = Path(data.resolve(config)), 0
-    wanted = count / (1 - config.val_fraction) + 1
+    wanted = count + len(task_names(config))  # of each task one is held out
     while (have := LeRobotDataset("local/part", root=path)).num_episodes < wanted:
-        times = min(MERGED_AT_ONCE, -(-int(wanted) // have.num_episodes))
+        times = min(MERGED_AT_ONCE, -(-wanted // have.num_episodes))
         k += 1
         path = folder / f"data_{k}"
         merge_datasets([have] * times, f"local/merged_{k}", path)
+        _say_where_episodes_are(path)
     return path
 
 
+def _say_where_episodes_are(root: Path) -> None:
+    """Correct each episode's note of the metadata file it is in, which LeRobot's merge leaves wrong."""
+    for file in root.glob("meta/episodes/chunk-*/file-*.parquet"):
+        chunk, number = (int(name.split("-")[1]) for name in (file.parent.name, file.stem))
+        table = pd.read_parquet(file)
+        table["meta/episodes/chunk_index"], table["meta/episodes/file_index"] = chunk, number
+        table.to_parquet(file)
+
+
 def light(episodes: Path, count: int, rounds: int, out: Path) -> dict[str, object]:
-    """Return settings under which clients do one local step, and nobody drives the arm."""
+    """Return settings under which clients do one local step, and nobody drives the arm.
+
+    Pictures are jittered, which turns the store of prefixes off: for one step a client it is more work than it saves.
+    """
     return {
         "data": str(episodes), "num_clients": count, "num_server_rounds": rounds, "fraction_train": 1.0,
         "fraction_evaluate": 0.0, "local_steps": 1, "eval_rollouts": 0, "eval_every": 0, "client_rollouts": 0,
-        "val_fraction": 1e-4, "out": str(out),
+        "val_fraction": 1e-4, "augment": True, "out": str(out),
     }  # fmt: skip
 
 

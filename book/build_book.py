@@ -243,6 +243,8 @@ def _rendering_config(root: Path) -> bytes:
     """Return the book's configuration with execution off: the chapters it renders are executed already."""
     config = yaml.safe_load((root / "_config.yml").read_text(encoding="utf-8"))
     config["execute"] |= {"execute_notebooks": "off"}
+    if config.get("repository", {}).get("url"):
+        config["html"] |= dict.fromkeys(("use_edit_page_button", "use_repository_button", "use_issues_button"), True)
     return yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode()
 
 
@@ -329,7 +331,9 @@ def render(source: Path, output: Path) -> Path:
     # In a process of its own: Sphinx patches docutils globally and changes sys.path.
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
     options = ["-W", "-n", "--keep-going", "--quiet"]
-    built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, check=False)  # warnings are on stderr
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where site_scripts.py lies
+    # Warnings are on stderr.
+    built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
     if built.returncode:
         raise BookError("jupyter-book reported the warnings above; the book is built strictly, so they are errors")
     return output / "_build" / "html"

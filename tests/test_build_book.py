@@ -5,6 +5,7 @@ from pathlib import Path
 import build_book
 import nbformat
 import pytest
+import yaml
 from build_book import BookError, Chapter
 
 ROOT = Path(__file__).parent.parent
@@ -71,6 +72,16 @@ def test_key_changes_with_the_stored_results_that_a_chapter_reads(project):
 @pytest.mark.unit
 def test_key_does_not_change_by_itself(project):
     assert build_book.library_key(project, "tiny") == build_book.library_key(project, "tiny")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("url", "buttons"), [("", False), ("https://example.org/book", True)])
+def test_one_setting_switches_the_buttons_to_the_source_on(tmp_path, url, buttons):
+    config = yaml.safe_load((ROOT / "_config.yml").read_text())
+    config["repository"]["url"] = url
+    (tmp_path / "_config.yml").write_text(yaml.safe_dump(config))
+    html = yaml.safe_load(build_book._rendering_config(tmp_path))["html"]
+    assert {html[f"use_{kind}_button"] for kind in ("edit_page", "repository", "issues")} == {buttons}
 
 
 @pytest.mark.unit

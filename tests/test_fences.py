@@ -50,6 +50,13 @@ def test_heavy_packages_stay_behind_their_fence(package):
     assert users - TOP <= FENCES[package]
 
 
+def test_exercises_are_light_and_nothing_leans_on_them():
+    """A reader's answer is checked at once; the library does not depend on what chapters ask."""
+    own = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "fedvla_lib" / "exercises").glob("*.py")}
+    assert not [name for name, tree in own.items() if {i.split(".")[0] for i in imports(tree)} & set(FENCES)]
+    assert not [name for name, tree in MODULES.items() if any("exercises" in i for i in imports(tree))]
+
+
 def test_nothing_can_load_a_pickle():
     """Weights are safetensors; whoever imports one of these could run what a stranger sent."""
     loaders = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}

@@ -1,0 +1,85 @@
+"""A chapter from the template: in its place, listed, and right by the tests that every chapter passes."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import new_chapter
+import pytest
+import test_exercises
+import test_notebooks
+from build_book import toc_pages
+
+ROOT = Path(__file__).parents[1]
+NAME = "97_made_by_a_test"
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """A copy of what a chapter touches, with a chapter more."""
+    root = tmp_path_factory.mktemp("project")
+    (root / "notebooks").mkdir()
+    shutil.copytree(ROOT / "fedvla_lib", root / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+    (root / "tests" / "wrong_answers").mkdir(parents=True)
+    shutil.copy(ROOT / "_toc.yml", root)
+    new_chapter.make(root, NAME)
+    return root
+
+
+@pytest.mark.unit
+def test_it_is_listed_behind_the_last_chapter(copy):
+    before = [page for page in toc_pages(ROOT) if page.startswith("notebooks/")]
+    assert [page for page in toc_pages(copy) if page.startswith("notebooks/")] == [*before, f"notebooks/{NAME}"]
+
+
+@pytest.mark.unit
+def test_it_passes_what_every_chapter_passes(copy):
+    notebook = copy / "notebooks" / f"{NAME}.ipynb"
+    checks = [
+        thing for name, thing in vars(test_notebooks).items() if name.startswith("test_") and "contents" not in name
+    ]
+    for check in checks:
+        check(notebook)
+    here = list(test_exercises.met(notebook))
+    assert len(here) >= test_exercises.AT_LEAST
+    assert {grade for grade in test_exercises.GRADES if any(f"({grade})" in one[2] for one in here)} == {
+        *test_exercises.GRADES
+    }
+
+
+@pytest.mark.integration
+def test_it_runs_and_its_exercises_are_checked(copy):
+    notebook = copy / "notebooks" / f"{NAME}.ipynb"
+    answers = [
+        solution + f'\nassert check("97.{name}", {name}).passed\n'
+        for _, name, _, _, solution in test_exercises.met(notebook)
+    ]
+    script = copy / "notebooks" / "answers.py"
+    script.write_text("import numpy as np\nfrom fedvla_lib.exercises import check\n\n" + "\n".join(answers))
+    environment = {**os.environ, "PYTHONPATH": str(copy), "FEDVLA_PROFILE": "tiny"}
+    subprocess.run([sys.executable, str(script)], env=environment, check=True, cwd=copy / "notebooks")
+    nbmake = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--nbmake",
+        str(notebook),
+        "--rootdir",
+        str(copy),
+    ]
+    assert subprocess.run([*nbmake, "-c", os.devnull], env=environment, cwd=copy).returncode == 0
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("name", "said"), [("privacy", "'privacy' is no name"), ("02_again", "taken by 02_partitioning")]
+)
+def test_a_name_that_cannot_be_used_is_named(name, said):
+    with pytest.raises(ValueError, match=said):
+        new_chapter.make(ROOT, name)
+    assert not list((ROOT / "notebooks").glob("*again*"))

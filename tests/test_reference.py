@@ -1,0 +1,82 @@
+"""Stored results: complete, stamped, of today's code or with a note; and no result typed into prose by hand."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fedvla_lib import arms, experiment, run_folder
+from fedvla_lib.config import code_digest
+
+pytestmark = pytest.mark.unit
+ROOT = Path(__file__).parents[1]
+REFERENCE = ROOT / "book" / "reference"
+CELLS = sorted(stamp.parent for stamp in REFERENCE.glob("*/*/stamp.json"))
+# Not results: the customary confidence, level and power, and the differences that examples set out to find.
+CUSTOMARY = {"95 %", "80 %", "5 %", "10 points"}
+RESULT = re.compile(r"\d[\d.,]*\s?(?:%|percent\b|points\b)")
+
+
+def stale(stamp, notes, code):
+    """Whether a stamp tells of other code than `code` and no note says why its result still holds."""
+    return stamp["code"] != code and not notes.get(stamp["code"], "").strip()
+
+
+def typed_results(text):
+    """Return what looks like a measured rate in prose, outside code, formulas and HTML."""
+    for no_prose in (r"```.*?```", r"~~~.*?~~~", r"`[^`]*`", r"\$[^$]*\$", r"<[^>]*>", r"^:\w+:.*$"):
+        text = re.sub(no_prose, "", text, flags=re.DOTALL | re.MULTILINE)
+    return [found for found in RESULT.findall(text) if found not in CUSTOMARY]
+
+
+def prose():
+    """Yield (where, text) of every page and every markdown cell."""
+    for page in [ROOT / "README.md", *sorted((ROOT / "book").glob("*.md"))]:
+        yield page.name, page.read_text()
+    for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        for cell in json.loads(notebook.read_text())["cells"]:
+            if cell["cell_type"] == "markdown":
+                yield f"{notebook.name} {cell['id']}", "".join(cell["source"])
+
+
+def test_each_stored_cell_is_complete_and_stamped():
+    assert CELLS
+    for cell in CELLS:
+        stamp = run_folder.read_stamp(cell)
+        assert stamp["status"] == "completed" and stamp["commit"] and stamp["config_hash"], cell
+        assert len(run_folder.read_metrics(cell, "rollout")) and len(run_folder.read_metrics(cell, "evaluate")), cell
+
+
+def test_each_stored_cell_is_one_that_its_file_asks_for():
+    for file in sorted(REFERENCE.glob("*.toml")):
+        if file.name != "notes.toml":
+            asked = {cell.name for cell in experiment.read_plan(file).cells}
+            stored = {cell.name for cell in CELLS if cell.parent.name == file.stem}
+            assert stored <= asked, f"{file.name}: {sorted(stored - asked)}"
+
+
+def test_results_of_other_code_carry_a_note():
+    notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], code_digest(*arms.TRAINED_BY)
+    found = {run_folder.read_stamp(cell)["code"] for cell in CELLS if stale(run_folder.read_stamp(cell), notes, code)}
+    assert not found, f"results of code {sorted(found)}, today's is {code}: run them again or add a note"
+
+
+def test_a_stale_stamp_without_a_note_is_found():
+    assert stale({"code": "old"}, {}, "new") and stale({"code": "old"}, {"old": " "}, "new")
+    assert not stale({"code": "old"}, {"old": "same arithmetic"}, "new") and not stale({"code": "new"}, {}, "new")
+
+
+def test_no_result_is_typed_into_prose():
+    found = [f"{where}: {typed}" for where, text in prose() for typed in typed_results(text)]
+    assert not found, found
+
+
+@pytest.mark.parametrize("text", ["FedAvg reaches 83 % here.", "It is 12.5 points ahead", "three in four: 75%"])
+def test_a_typed_result_is_found(text):
+    assert typed_results(f"Before. {text} After `5 %` and $p = 90\\%$.")
+
+
+def test_customary_numbers_and_code_are_no_results():
+    assert not typed_results("A 95 % interval; `x = 83 %`; $83\\%$; <img width='50%'>\n:width: 100%\n```\n12 %\n```")
