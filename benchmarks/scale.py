@@ -51,8 +51,7 @@ def main() -> None:
             for name in chosen.engines:
                 settings = light(episodes, count, chosen.rounds, Path(folder) / f"{name}_{count}")
                 rows.append({"engine": name, "clients": count, **measure({"engine": name, **settings}, chosen.profile)})
-                print(rows[-1], flush=True)
-    report("scale", rows, chosen.out)
+                report("scale", rows, chosen.out)  # each time: the last are long, and what is known is kept
 
 
 def repeated(config: Config, count: int, folder: Path) -> Path:

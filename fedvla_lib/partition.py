@@ -49,7 +49,8 @@ def partition(
     _check_request(table, num_clients, scheme, alpha)
     table = table.sort_values(["task", "episode_id"], kind="stable").reset_index(drop=True)
     if scheme == "modulo":
-        parts = [table["episode_id"].iloc[client::num_clients].tolist() for client in range(num_clients)]
+        ids = table["episode_id"].to_numpy()
+        parts = [ids[client::num_clients].tolist() for client in range(num_clients)]
     elif scheme == "task":
         parts = _by_task(table, num_clients)
     elif scheme == "lab":

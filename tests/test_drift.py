@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fedvla_lib.drift import geometry
+from fedvla_lib.drift import MOST_COMPARED, geometry
 from fedvla_lib.params import layer_of
 
 pytestmark = pytest.mark.unit
@@ -32,3 +32,12 @@ def test_lengths_and_angles_are_those_of_the_updates():
 def test_opposite_updates_point_apart():
     found = geometry(START, {"a": moved(1, [1, 0]), "b": moved(-1, [-1, 0])})
     assert found["a"]["toward.b"] == pytest.approx(-1)
+
+
+def test_many_clients_are_compared_with_their_mean_only():
+    rng = np.random.default_rng(0)
+    ends = {f"client_{k}": moved(rng.normal(size=(2, 1)), rng.normal(size=2)) for k in range(MOST_COMPARED + 1)}
+    few = dict(list(ends.items())[:MOST_COMPARED])
+    assert any(name.startswith("toward") for name in geometry(START, few)["client_0"])
+    found = geometry(START, ends)["client_0"]
+    assert not any(name.startswith("toward") for name in found) and -1 <= found["cosine.all"] <= 1
