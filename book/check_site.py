@@ -108,6 +108,7 @@ def look(page: Page, address: str) -> list[str]:
     page.goto(address, wait_until="networkidle")
     found += page.evaluate(FIGURES) + page.evaluate(VIDEOS) + [f"light: {line}" for line in barriers(page)]
     page.evaluate(DARK)
+    page.wait_for_timeout(500)  # colours fade over
     found += page.evaluate(DARK_FIGURES) + [f"dark: {line}" for line in barriers(page)]
     page.set_viewport_size(NARROW)
     return found + page.evaluate(WIDTH)
