@@ -81,7 +81,7 @@ def dead_links(folder: Path, page: str) -> list[str]:
         target = urlparse(urljoin(page, href)) if not href.startswith("#") else urlparse(page + href)
         if target.scheme or target.netloc or href in ("", "#"):
             continue
-        file = folder / unquote(target.path)
+        file = folder / unquote(target.path).lstrip("/")  # the page for what is not found links from the root
         if not file.is_file():
             found.append(f"links to {href}, which is not there")
         elif target.fragment and file.suffix == ".html" and not _has(file, unquote(target.fragment)):
