@@ -1,5 +1,10 @@
 """Closed-loop rollouts per minute: this library against lerobot-eval, same policy, same environment, same seeds.
 
+Both sides drive 16 arms at a time, film what they do (lerobot-eval the first ten attempts, this library all of them),
+and draw the same noise: the policy's look number k at a scene has the k-th draw of one generator, whatever the seed of
+the scene, so that the same attempts should succeed. lerobot-eval is measured twice: on one core like this library, with
+its environments in its own process, and as it comes, with a process for each environment on all cores.
+
     python benchmarks/rollouts.py --policy outputs/DATE_TIME/global_model/round_8
 """
 
@@ -8,13 +13,18 @@ import os
 import subprocess
 import sys
 import tempfile
+from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
-from report import laptop, options, report, start, timed
+import torch
+from report import cores, laptop, options, report, start, timed
 
 from fedvla_lib import evaluate, model
 from fedvla_lib.config import Config
 from fedvla_lib.evaluate import FIRST_SEED
+
+AS_LEROBOT = "as-lerobot-eval"  # first argument with which this script calls itself to run lerobot-eval
 
 
 def main() -> None:
@@ -23,49 +33,90 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, required=True, help="a saved policy")
     parser.add_argument("--task", default="lift", help="the task")
     parser.add_argument("--rollouts", type=int, default=32, help="attempts of each side")
-    parser.add_argument("--batch", type=int, default=8, help="environments that lerobot-eval runs at once")
+    parser.add_argument("--batch", type=int, default=evaluate.AT_ONCE, help="environments lerobot-eval runs at once")
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
-    seeds = evaluate.rollout_seeds(chosen.rollouts)
+    torch.set_num_threads(1)
     rows: list[dict] = []
-    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, seeds)))
+    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, evaluate.rollout_seeds(chosen.rollouts))))
+    report("rollouts", [compared(chosen, config, rows, ours_s, own) for own in (False, True)], chosen.out)
+
+
+def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float, own_processes: bool) -> dict[str, Any]:
+    """Measure lerobot-eval one way and hold it against our rows."""
     with tempfile.TemporaryDirectory() as folder:
-        theirs_s, successes = lerobot_eval(chosen, config, Path(folder))
-    agree = sum(row["success"] == success for row, success in zip(rows, successes, strict=True))
-    row = {
+        theirs_s, successes = lerobot_eval(chosen, config, Path(folder), own_processes)
+    return {
+        "lerobot-eval's environments": "a process each" if own_processes else "in its own process",
+        "its cores": cores() if own_processes else 1,
         "task": chosen.task,
         "rollouts": chosen.rollouts,
-        "ours [1/min]": 60 * chosen.rollouts / ours_s,
+        "ours, one core [1/min]": 60 * chosen.rollouts / ours_s,
         "lerobot-eval [1/min]": 60 * chosen.rollouts / theirs_s,
         "ratio": theirs_s / ours_s,
         "our successes": sum(row["success"] for row in rows),
         "lerobot's": sum(successes),
-        "seeds that agree": agree,
+        "seeds that agree": sum(row["success"] == won for row, won in zip(rows, successes, strict=True)),
     }
-    report("rollouts", [row], chosen.out)
+
+
+class SameNoise(model.PolicyActor):
+    """A policy that draws the same noise in every episode."""
+
+    def reset(self, env: Any, seed: int) -> None:
+        """Start an episode with the first draw."""
+        super().reset(env, FIRST_SEED)
 
 
 def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
     """Load the policy and roll out, as the command line does."""
-    actor = model.PolicyActor(model.load_policy(config))
-    return evaluate.evaluate(actor, [task], seeds, image_size=config.image_size, progress=False)
+    actor = SameNoise(model.load_policy(config))
+    with tempfile.TemporaryDirectory() as films:
+        return evaluate.evaluate(
+            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), progress=False
+        )
 
 
-def lerobot_eval(chosen: object, config: Config, folder: Path) -> tuple[float, list[bool]]:
+def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes: bool) -> tuple[float, list[bool]]:
     """Run LeRobot's command; return the seconds it reports for its episodes, and whether each succeeded."""
     command = [
-        sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={chosen.policy}",
+        sys.executable, __file__, AS_LEROBOT, f"--policy.path={chosen.policy}",
         "--policy.device=cpu", "--env.type=so100_sim", f"--env.task={chosen.task}",
         f"--env.image_size={config.image_size}", "--env.discover_packages_path=fedvla_lib.lerobot_env",
         f"--eval.n_episodes={chosen.rollouts}", f"--eval.batch_size={chosen.batch}", f"--seed={FIRST_SEED}",
-        f"--output_dir={folder / 'out'}",
+        f"--eval.use_async_envs={str(own_processes).lower()}", f"--output_dir={folder / 'out'}",
     ]  # fmt: skip
     settings = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=settings)
+    first = min(os.sched_getaffinity(0))
+    pinned = None if own_processes else lambda: os.sched_setaffinity(0, {first})
+    subprocess.run(command, check=True, capture_output=True, env=settings, preexec_fn=pinned)
     found = json.loads((folder / "out" / "eval_info.json").read_text())
     one = found["per_task"][0]["metrics"]
     return found["overall"]["eval_s"], list(one["successes"])
 
 
+def as_lerobot_eval() -> None:
+    """LeRobot's command with the noise of `SameNoise`: its policy's own methods, told which numbers to draw."""
+    from lerobot.policies.smolvla import SmolVLAPolicy
+    from lerobot.policies.smolvla.modeling_smolvla import VLAFlowMatching
+    from lerobot.scripts.lerobot_eval import main as evaluate_policy
+
+    forget, source = SmolVLAPolicy.reset, SameNoise(bundle=None)
+
+    def reset(policy: SmolVLAPolicy) -> None:
+        forget(policy)
+        source.reset(Namespace(instruction=""), FIRST_SEED)
+
+    def sample_noise(_: VLAFlowMatching, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+        return torch.randn((1, *shape[1:]), generator=source._generator).expand(shape).to(device)
+
+    SmolVLAPolicy.reset, VLAFlowMatching.sample_noise = reset, sample_noise
+    evaluate_policy()
+
+
 if __name__ == "__main__":
-    start(main)
+    if sys.argv[1:2] == [AS_LEROBOT]:
+        del sys.argv[1]
+        as_lerobot_eval()
+    else:
+        start(main)

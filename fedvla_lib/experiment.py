@@ -191,7 +191,8 @@ def _base(config: Config, seeds: Sequence[int]) -> Measured:
 def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
     began = time.perf_counter()
     bundle = arms.centralized(config, progress=False)
-    return replace(_of_model(bundle, config, seeds), train_s=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return replace(_of_model(bundle, config, seeds), train_s=seconds)
 
 
 def _federated(config: Config, seeds: Sequence[int]) -> Measured:

@@ -14,6 +14,8 @@ OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "tr
 def read_results(folder: Path) -> pd.DataFrame:
     """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
 
+    train_s is NaN where a cell's stamp has no time of its training.
+
     Raises:
         ValueError: there is no result.
     """
@@ -29,7 +31,8 @@ def _cells(folder: Path) -> Iterator[Path]:
 
 def _known(cell: Path) -> dict[str, Any]:
     stamp = run_folder.read_stamp(cell)
-    return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"]}
+    known = {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"]}
+    return known | {"train_s": float("nan") if known["train_s"] is None else known["train_s"]}
 
 
 def _attempts(cell: Path) -> pd.DataFrame:

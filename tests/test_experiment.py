@@ -122,6 +122,8 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     assert rows.groupby("arm").loss.first().nunique() == 4
     stamp = run_folder.read_stamp(out / "mixed_averaged_0")
     assert stamp["status"] == "completed" and stamp["commit"] and stamp["code"] and stamp["wall_s"] > 0
+    pooled = run_folder.read_stamp(out / "mixed_pooled_0")
+    assert 0 < pooled["train_s"] < 0.95 * pooled["wall_s"]  # what measures a model is no part of its training
     alone = run_folder.read_metrics(out / "mixed_alone_0", "rollout")
     assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
