@@ -6,12 +6,14 @@
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
 # Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
-# torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv).
+# torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
+# share the test files; every one computes on one thread and takes 2 GB).
 .DEFAULT_GOAL := help
 .PHONY: help env book check-site data doctor test lint lab lock new-chapter clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
+TEST_WORKERS ?= 2
 BIN := .venv/bin
 UV := .uv/bin/uv
 LOCK := requirements.lock
@@ -100,7 +102,8 @@ lint: $(STAMP)
 test: export FEDVLA_PROFILE := tiny
 test: export HF_HUB_OFFLINE := 1
 test: doctor lint
-	$(BIN)/pytest --cov --cov-report term --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
+	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --durations 20 --cov --cov-report term \
+	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
 	$(BIN)/pytest --nbmake --nbmake-timeout 300 --durations 0 --junitxml _build/tests/junit-notebooks.xml notebooks
 	$(BIN)/python book/build_book.py --profile tiny --execute-only
 
