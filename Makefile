@@ -47,7 +47,7 @@ export MUJOCO_GL ?= egl
 endif
 
 help:
-	@sed -n '1,9s/^# \{0,1\}//p' Makefile
+	@sed -n '1,10s/^# \{0,1\}//p' Makefile
 
 env: $(STAMP)
 

@@ -162,16 +162,20 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
     """
     if rows.duplicated(["run", "task", "seed"]).any():
         raise ValueError("a training seed ran a (task, seed) twice: give the attempts of one arm and partition")
-    table = rows.astype({"success": float}).pivot(index="run", columns=["task", "seed"], values="success")
+    table = rows.astype({"success": float}).pivot(index="run", columns=["task", "seed"], values="success").sort_index(axis=1)
     if table.isna().any(axis=None):
         raise ValueError(f"training seeds {list(table.index[table.isna().any(axis=1)])} lack attempts of the others")
     return table
 
 
 def success_interval(rows: pd.DataFrame, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Interval of an arm's success rate: Wilson's for one training seed, `over_seeds` for several."""
-    if rows.run.nunique() == 1:
-        return wilson(int(rows.success.sum()), len(rows), confidence)
+    """Interval of an arm's success rate: Wilson's for one training seed, `over_seeds` for several.
+
+    Where all attempts of all seeds ended alike there is no variance to go by: Wilson's for the attempts of one seed.
+    """
+    if rows.run.nunique() == 1 or rows.success.nunique() == 1:
+        one = rows[rows.run == rows.run.iloc[0]]
+        return wilson(int(one.success.sum()), len(one), confidence)
     found = over_seeds(by_run(rows), confidence)
     return max(found["low"], 0.0), min(found["high"], 1.0)
 

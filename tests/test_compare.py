@@ -194,3 +194,20 @@ def test_the_crossed_bootstrap_is_as_wide_as_the_spread_of_seeds_when_only_they_
     low, high = compare.crossed_bootstrap(outcomes(np.repeat(each[:, None], 10, axis=1)), seed=0, resamples=20_000)
     draws = np.random.default_rng(1).choice(each, (20_000, 5)).mean(axis=1)
     assert (low, high) == pytest.approx(tuple(np.quantile(draws, [0.025, 0.975])), abs=0.021)
+
+
+def test_the_order_in_which_attempts_were_made_does_not_matter():
+    rng = np.random.default_rng(0)
+    rows = [{"arm": arm, "run": run, "task": "lift", "seed": seed, "success": rng.random() < 0.5}
+            for arm in "ab" for run in (0, 1, 2) for seed in range(12)]  # fmt: skip
+    table = pd.DataFrame(rows)
+    dealt_out = pd.concat([table[table.arm == "a"], table[table.arm == "b"].sort_values("seed", ascending=False)])
+    there, here = (compare.difference_over_seeds(of, "a", "b", seed=0) for of in (table, dealt_out))
+    assert there == here
+
+
+@pytest.mark.parametrize("ending", [False, True])
+def test_attempts_that_all_end_alike_leave_room_for_doubt(ending):
+    rows = [{"run": run, "task": "lift", "seed": seed, "success": ending} for run in (0, 1) for seed in range(30)]
+    low, high = compare.success_interval(pd.DataFrame(rows))
+    assert (low, high) == pytest.approx(compare.wilson(30 * ending, 30)) and high - low > 0.05
