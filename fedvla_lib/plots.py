@@ -591,7 +591,7 @@ def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = N
     return ax
 
 
-def success_intervals(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes | None = None) -> Axes:
     """Draw a success rate with its interval for each line; columns arm, partition, success_rate, low, high.
 
     A partition has a colour and a place within the arm's row, so that arms can be compared in each.
@@ -609,8 +609,10 @@ def success_intervals(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.invert_yaxis()
     ax.set_xlim(-2, 102)
     ax.set_xlabel("success rate [%], 95 % interval")
-    ax.set_ylabel("strategy")
-    ax.legend(frameon=False, ncols=len(partitions), loc="lower center", bbox_to_anchor=(0.5, 1.0), title="partition")
+    ax.set_ylabel(ylabel)
+    if len(partitions) > 1:
+        at = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+        ax.legend(frameon=False, ncols=len(partitions), title="partition", **at)
     return ax
 
 
@@ -625,7 +627,7 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
     ax.set_xlabel("everything that travelled [MB]")
-    ax.set_ylabel("success rate [%], 95 % Wilson interval")
+    ax.set_ylabel("success rate [%], 95 % interval")
     ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     return ax
 

@@ -250,6 +250,8 @@ def test_success_intervals_show_rate_and_both_ends_in_percent():
     (_, _, (bars,)) = ax.containers[1]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0, 30])
     assert round(points["task"][0, 1]) == 0  # in the row of its arm
+    alone = plots.success_intervals(table[:2], ylabel="statistics")
+    assert alone.get_ylabel() == "statistics" and alone.get_legend() is None  # one partition needs no name
 
 
 def test_success_by_bytes_names_every_point():
