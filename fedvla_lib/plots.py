@@ -636,13 +636,13 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
     """Draw held-out loss and success against gradient steps, an arm a colour: mean and range over training seeds.
 
     Args:
-        rounds: columns arm, run, steps, loss, success_rate.
+        rounds: columns arm, run, steps, loss, success_rate (NaN: not measured).
     """
     if axes is None:
         _, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.4), layout="constrained")
     for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
         for ax, value in zip(axes, ("loss", "success_rate"), strict=True):
-            over = part.groupby("steps")[value].agg(["mean", "min", "max"])
+            over = part.dropna(subset=[value]).groupby("steps")[value].agg(["mean", "min", "max"])
             ax.plot(over.index, over["mean"], "o-", color=PALETTE[i % len(PALETTE)], label=arm)
             ax.fill_between(over.index, over["min"], over["max"], color=PALETTE[i % len(PALETTE)], alpha=0.15)
             ax.set_xlabel("gradient steps of all clients")

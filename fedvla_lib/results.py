@@ -4,11 +4,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from scipy.stats import spearmanr
 
 from fedvla_lib import compare, run_folder
 
 OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
+OF_RUN = ("partition", "arm", "run")
 
 
 def read_results(folder: Path) -> pd.DataFrame:
@@ -46,7 +49,11 @@ def read_rounds(folder: Path) -> pd.DataFrame:
     """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
 
     Columns: partition, arm, run, round, steps (gradient steps of all clients up to there), loss, action_error, n,
-    successes, success_rate. Rounds that made no attempt have n = 0 and no rate.
+    successes, success_rate. Rounds that made no attempt have n = 0 and no rate. The last round was
+    measured with the attempts of `read_results`, earlier ones with those of the training itself.
+
+    Raises:
+        ValueError: there is no result, or none of a federated cell.
     """
     tables = []
     for cell in _cells(folder):
@@ -56,10 +63,67 @@ def read_rounds(folder: Path) -> pd.DataFrame:
             made = run_folder.read_metrics(cell, "rollout").groupby("round").success.agg(n="size", successes="sum")
             rounds = measured.join(made).fillna({"n": 0, "successes": 0}).astype({"n": int, "successes": int})
             steps = known["gradient_steps"] * rounds.index / rounds.index.max()
-            named = {key: known[key] for key in ("partition", "arm", "run")}
+            named = {key: known[key] for key in OF_RUN}
             tables.append(rounds.assign(**named, steps=steps.astype(int)).reset_index())
+    if not tables:
+        raise ValueError(f"no federated cell in {folder}: only those have rounds")
     table = pd.concat(tables, ignore_index=True)
     return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
+
+
+def correlations(rounds: pd.DataFrame, by: Sequence[str] = OF_RUN) -> pd.DataFrame:
+    """Return Spearman's correlation of held-out loss with success over the checkpoints of each group, and over all.
+
+    Columns partition, arm, run ("all" where the line does not tell them apart; everywhere in the last line), n
+    (checkpoints), rho: -1 if the loss ranks them as success does, NaN if all are alike or there is one only.
+
+    Args:
+        rounds: of `read_rounds`; what made no attempt is left out.
+        by: columns that make a group, of partition, arm and run.
+    """
+    measured = rounds.dropna(subset=["loss", "success_rate"])
+    groups = [(dict(zip(by, key, strict=True)), part) for key, part in measured.groupby(list(by), sort=False)]
+    return pd.DataFrame([
+        {**dict.fromkeys(OF_RUN, "all"), **group, "n": len(part), "rho": _spearman(part)}
+        for group, part in [*groups, ({}, measured)]
+    ])  # fmt: skip
+
+
+def _spearman(part: pd.DataFrame) -> float:
+    if min(part.loss.nunique(), part.success_rate.nunique()) < 2:
+        return float("nan")  # nothing to rank
+    return float(spearmanr(part.loss, part.success_rate).statistic)
+
+
+def clear_pairs(rounds: pd.DataFrame) -> pd.DataFrame:
+    """Return the pairs of checkpoints that differ in loss and whose intervals of success (Wilson's) are apart.
+
+    Columns partition, arm, run, round, loss, n, successes, success_rate, low, high of the one with the lower loss, the
+    same with `other_` in front of the other; gap: what lies between the intervals; misled: the lower loss succeeds
+    less often; same_run, and same_episodes: partition and training seed are the same, so the held-out episodes are.
+
+    Args:
+        rounds: of `read_rounds`; what made no attempt is left out.
+    """
+    table = rounds.dropna(subset=["loss", "success_rate"]).sort_values("loss", kind="stable", ignore_index=True)
+    ends = [compare.wilson(int(k), int(n)) for k, n in zip(table.successes, table.n, strict=True)]
+    table["low"], table["high"] = np.array(ends, dtype=float).reshape(-1, 2).T
+    one, other = np.triu_indices(len(table), k=1)
+    low, high = table.low.to_numpy(), table.high.to_numpy()
+    gap = np.maximum(low[one] - high[other], low[other] - high[one])
+    kept = (gap > 0) & (table.loss.to_numpy()[one] < table.loss.to_numpy()[other])
+    of = [*OF_RUN, "round", "loss", "n", "successes", "success_rate", "low", "high"]
+    sides = [table.loc[places[kept], of].reset_index(drop=True) for places in (one, other)]
+    pairs = sides[0].join(sides[1].add_prefix("other_")).assign(gap=gap[kept])
+    shared = (pairs.partition == pairs.other_partition) & (pairs.run == pairs.other_run)
+    same_run = shared & (pairs.arm == pairs.other_arm)
+    return pairs.assign(misled=pairs.success_rate < pairs.other_success_rate, same_run=same_run, same_episodes=shared)
+
+
+def disagreements(rounds: pd.DataFrame) -> pd.DataFrame:
+    """Return those of `clear_pairs` whose lower loss succeeds less often, the widest gap first."""
+    pairs = clear_pairs(rounds)
+    return pairs[pairs.misled].sort_values("gap", ascending=False, kind="stable", ignore_index=True)
 
 
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:

@@ -262,3 +262,29 @@ def test_success_by_bytes_names_every_point():
     assert labelled(ax) and ax.get_xscale() == "log"
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b"]
     np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata(), [[100, 90]])
+
+
+def checkpoint_table():
+    return pd.DataFrame(
+        {"arm": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],
+         "loss": [3.0, 1.0, 5.0, 2.0, 3.0, 2.5, 2.0], "success_rate": [0.0, 0.4, 0.0, 0.8, 0.0, np.nan, 0.5]}
+    )  # fmt: skip
+
+
+def test_learning_curves_show_mean_and_range_over_seeds():
+    axes = plots.learning_curves(checkpoint_table())
+    assert all(map(labelled, axes)) and axes[0].get_yscale() == "log"
+    np.testing.assert_allclose(axes[0].lines[0].get_xydata(), [[0, 4], [8, 1.5]])
+    np.testing.assert_allclose(axes[1].lines[0].get_xydata(), [[0, 0], [8, 0.6]])
+    np.testing.assert_allclose(axes[1].lines[1].get_xydata(), [[0, 0], [8, 0.5]])  # no gap where none was measured
+    band = axes[1].collections[0].get_paths()[0].vertices
+    assert band[:, 1].max() == 0.8 and band[band[:, 0] == 8][:, 1].min() == 0.4
+    (legend,) = axes[0].figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+
+
+def test_checkpoints_are_points_of_loss_and_success():
+    ax = plots.checkpoints(checkpoint_table())
+    assert labelled(ax) and [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b"]
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[3, 0], [1, 0.4], [5, 0], [2, 0.8]])
+    assert ax.lines[0].get_linestyle() == "None" and ax.lines[0].get_marker() != ax.lines[1].get_marker()

@@ -1,0 +1,68 @@
+"""Checkpoints of stored runs: how held-out loss ranks them beside success, and which pairs it ranks the wrong way."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from fedvla_lib import results
+
+pytestmark = pytest.mark.unit
+
+
+def rounds(*lines):
+    """Checkpoints from (arm, run, round, loss, successes, n)."""
+    table = pd.DataFrame(lines, columns=["arm", "run", "round", "loss", "successes", "n"]).assign(partition="task")
+    return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
+
+
+def test_correlations_are_of_ranks_within_each_run_and_over_all():
+    table = rounds(
+        ("a", 0, 1, 9.0, 0, 10), ("a", 0, 2, 0.3, 1, 10), ("a", 0, 3, 0.2, 9, 10), ("a", 0, 4, 0.1, 0, 0),
+        ("b", 0, 1, 0.5, 2, 10), ("b", 0, 2, 0.6, 3, 10), ("b", 1, 1, 0.7, 4, 10), ("b", 1, 2, 0.8, 4, 10),
+    )  # fmt: skip
+    found = results.correlations(table)
+    assert found[["arm", "run"]].values.tolist() == [["a", 0], ["b", 0], ["b", 1], ["all", "all"]]
+    assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without an attempt is none
+    np.testing.assert_allclose(found.rho[:3], [-1, 1, np.nan])  # all alike: no rank, and no warning
+    seen = table[table.n > 0]
+    assert found.rho.iloc[-1] == pytest.approx(seen.loss.rank().corr(seen.success_rate.rank()))
+    assert results.correlations(table, ["run"])[["arm", "run", "n"]].values.tolist() == [
+        ["all", 0, 5], ["all", 1, 2], ["all", "all", 7],
+    ]  # fmt: skip
+
+
+def test_clear_pairs_are_apart_and_disagreements_are_those_that_the_loss_misleads():
+    table = rounds(
+        ("a", 0, 1, 0.5, 0, 60), ("a", 0, 2, 0.2, 30, 60), ("b", 0, 1, 0.3, 58, 60), ("b", 1, 1, 0.1, 10, 60),
+        ("b", 1, 2, 0.2, 60, 60), ("b", 1, 3, 0.05, 0, 0),
+    )  # fmt: skip
+    pairs = results.clear_pairs(table)
+    assert (pairs.loss < pairs.other_loss).all() and (pairs.gap > 0).all()
+    apart = (pairs.low > pairs.other_high) | (pairs.high < pairs.other_low)
+    assert apart.all() and len(pairs) == 8  # of 10: one has equal losses, in one the intervals overlap
+    assert pairs.same_run.sum() == 2 and pairs.same_episodes.sum() == 4
+    assert not pairs[pairs.same_run & (pairs.arm == "a")].misled.any()
+
+    found = results.disagreements(table)
+    assert (found.success_rate < found.other_success_rate).all() and found.gap.is_monotonic_decreasing
+    named = found[["arm", "run", "round", "other_arm", "other_run", "other_round"]].values.tolist()
+    assert named == [["b", 1, 1, "b", 1, 2], ["b", 1, 1, "b", 0, 1], ["a", 0, 2, "b", 0, 1], ["b", 1, 1, "a", 0, 2]]
+    assert found.gap[0] == pytest.approx(found.other_low[0] - found.high[0])
+
+
+def test_without_a_clear_pair_the_tables_are_empty():
+    for table in (rounds(("a", 0, 1, 0.5, 1, 2), ("a", 0, 2, 0.2, 0, 2)), rounds(("a", 0, 1, 0.5, 0, 0))):
+        assert len(results.clear_pairs(table)) == len(results.disagreements(table)) == 0
+    assert np.isnan(results.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
+
+
+def test_a_folder_without_federated_cells_is_named(tmp_path):
+    known = {"arm": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1, "samples": 1,
+             "bytes": 0, "train_s": None}  # fmt: skip
+    (tmp_path / "task_pooled_0").mkdir()
+    (tmp_path / "task_pooled_0" / "stamp.json").write_text(json.dumps(known))
+    with pytest.raises(ValueError, match="no federated cell") as caught:
+        results.read_rounds(tmp_path)
+    assert str(tmp_path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
