@@ -648,9 +648,12 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
             ax.set_xlabel("gradient steps of all clients")
     axes[0].set_ylabel("held-out loss [normalised units²]")
     axes[0].set_yscale("log")
+    axes[0].yaxis.set_major_locator(plt.LogLocator(subs=(1, 2, 5)))
+    axes[0].yaxis.set_major_formatter("{x:g}")
+    axes[0].yaxis.set_minor_formatter(plt.NullFormatter())
     axes[1].set_ylabel("success rate")
     axes[1].set_ylim(-0.02, 1.02)
-    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside upper center")
+    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="outside upper center")
     return axes
 
 
