@@ -25,6 +25,13 @@ NARROW = {"width": 360, "height": 740}  # pixels of a small phone
 WIDE = {"width": 1280, "height": 900}
 SEARCHED = "FedAvg"
 SEVERE = {"serious", "critical"}
+REQUIRED = ("404.html", "sitemap.xml")  # what extensions of _config.yml make beside the pages of the contents
+VIDEO_BYTES = 1_000_000  # a video above this makes a reader on a phone wait
+# Headless, in a container without a graphics card, and asking the network for nothing but the pages.
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
+]  # fmt: skip
 SHORT_ALT = 12  # characters; a shorter text does not say what a figure shows
 
 # Each returns a list of sentences about what is wrong on the page.
@@ -89,6 +96,25 @@ def dead_links(folder: Path, page: str) -> list[str]:
     return found
 
 
+def missing_files(folder: Path) -> list[str]:
+    """Return which of the files that every rendered book has are not there."""
+    return [f"{name} is missing" for name in REQUIRED if not (folder / name).is_file()]
+
+
+def heavy_videos(folder: Path, page: str) -> list[str]:
+    """Return the videos of a page that hold more than `VIDEO_BYTES`; inside the page, its text counts."""
+    tags = _soup(folder / page).select("video[src], video source[src]")
+    sizes = [_bytes_of(folder, page, tag["src"]) for tag in tags]
+    return [f"video {i} has {size / 1e6:.1f} MB" for i, size in enumerate(sizes, start=1) if size > VIDEO_BYTES]
+
+
+def _bytes_of(folder: Path, page: str, source: str) -> int:
+    if source.startswith("data:"):
+        return len(source)
+    file = folder / unquote(urlparse(urljoin(page, source)).path).lstrip("/")
+    return file.stat().st_size if file.is_file() else 0  # the browser says that it is missing
+
+
 def _soup(file: Path) -> BeautifulSoup:
     return BeautifulSoup(file.read_text(encoding="utf-8"), "html.parser")
 
@@ -133,9 +159,10 @@ def searched(page: Page, address: str) -> list[str]:
 def check(folder: Path, only: str = "") -> dict[str, list[str]]:
     """Return what is wrong with each page of a site; pages with nothing are left out."""
     chosen = [page for page in pages(folder) if only in page]
-    found = {page: dead_links(folder, page) for page in chosen}
+    found = {page: dead_links(folder, page) + heavy_videos(folder, page) for page in chosen}
+    found["site"] = missing_files(folder)
     with served(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=_chromium(), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
         for name in tqdm(chosen, desc="pages", disable=not sys.stderr.isatty()):
             found[name] += _with_new_page(browser, look, address + name)
         found["search"] = _with_new_page(browser, searched, address)
