@@ -2,6 +2,7 @@
 # make test   run everything that guards it                               make lab     open the notebooks
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
+# make zip    notebooks, results and library in one file
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -9,7 +10,7 @@
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
 # share the test files; every one computes on one thread and takes 2 GB).
 .DEFAULT_GOAL := help
-.PHONY: help env book check-site data doctor test lint lab lock new-chapter clean
+.PHONY: help env book check-site data doctor test lint lab lock new-chapter zip clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -87,6 +88,10 @@ book: doctor
 # Every page of the rendered book, in the system's Chromium.
 check-site: $(STAMP)
 	$(BIN)/python book/check_site.py _build/html/$(FEDVLA_PROFILE)
+
+# What is attached to a release.
+zip: $(STAMP)
+	$(BIN)/python book/make_zip.py
 
 new-chapter: $(STAMP)
 	@$(BIN)/python book/new_chapter.py "$(NAME)"
