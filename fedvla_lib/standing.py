@@ -1,7 +1,7 @@
 """A SuperLink that stays up between commands, for `flwr run . local-simulation` in a shell.
 
 `flwr run` would start one by itself, and gives it 15 s, which a cold machine with two cores does not make. This one is
-started first, waited for, and stopped by name; its connection file, `flower/config.toml`, comes with the project.
+started first, waited for, and stopped by name; its connection file, `connections.toml`, comes with the package.
 """
 
 import json
@@ -15,7 +15,7 @@ from fedvla_lib import superlink
 from fedvla_lib.run_folder import write_json
 from fedvla_lib.superlink import FlowerRunError
 
-CONNECTIONS = Path(__file__).resolve().parents[1] / "flower" / "config.toml"
+CONNECTIONS = Path(__file__).resolve().parent / "connections.toml"
 
 
 def up(home: Path) -> str:
@@ -23,7 +23,7 @@ def up(home: Path) -> str:
 
     Raises:
         FlowerRunError: it did not answer within two minutes; nothing is left running.
-        ValueError: not in a checkout, or something else uses its port.
+        ValueError: something else uses its port.
     """
     if process := _running(home):
         return f"{_where()} is up already, process {process.pid}"
@@ -74,6 +74,4 @@ def _running(home: Path) -> psutil.Process | None:
 
 
 def _where() -> str:
-    if not CONNECTIONS.is_file():
-        raise ValueError(f"no {CONNECTIONS}: start the SuperLink from a checkout of the book")
     return tomllib.loads(CONNECTIONS.read_text())["superlink"]["local-simulation"]["address"]

@@ -18,11 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,7 @@ OFFLINE = {  # Flower and Ray ask the network nothing
     "RAY_USAGE_STATS_ENABLED": "0",
 }
 CONNECTION = "book"
+PROJECT = "fedvla-lib"  # as pyproject.toml and the installed package name it
 
 
 class FlowerRunError(RuntimeError):
@@ -109,7 +112,7 @@ def run_simulation(
 
     Raises:
         FlowerRunError: the run failed, or did not finish in time.
-        ValueError: unusable settings, or no checkout with a pyproject.toml around this library.
+        ValueError: unusable settings.
     """
     config = check(replace(absolute(config), num_threads=config.num_threads or cpus_per_client))
     before = run_folders(config)
@@ -179,23 +182,54 @@ def start(command: list[str], environment: dict[str, str], log: Path) -> subproc
 
 
 def stage_app(folder: Path) -> Path:
-    """Copy what the Flower app needs into ``folder/app`` and return it: `flwr` would search the whole checkout."""
+    """Copy what the Flower app needs into ``folder/app`` and return it: `flwr` would search the whole checkout.
+
+    A library that was installed from its wheel has no project file beside it; the app then gets one of its own.
+    """
     package = Path(__file__).resolve().parent
-    project = package.parent / "pyproject.toml"
-    if not project.is_file():
-        raise ValueError(f"no {project}: run Flower's engines from a checkout of the book")
     app = folder / "app"
     shutil.copytree(package, app / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(package.parent / name, app / name)
+    if _is_checkout(package.parent):
+        for name in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copy(package.parent / name, app / name)
+    else:
+        (app / "pyproject.toml").write_text(_project_file(package.name))
     return app
 
 
+def _is_checkout(folder: Path) -> bool:
+    """Whether this is the project's own folder: a stranger's pyproject.toml may lie in site-packages."""
+    project = folder / "pyproject.toml"
+    return project.is_file() and tomllib.loads(project.read_text()).get("project", {}).get("name") == PROJECT
+
+
+def _project_file(package: str) -> str:
+    """Return the least that `flwr` takes as a project: a name, the two apps, the settings and what to bundle."""
+    try:
+        release = version(PROJECT)
+    except PackageNotFoundError:  # a copied folder
+        release = "0"
+    tables = {
+        "project": {"name": PROJECT, "version": release, "description": "", "license": "Apache-2.0"},
+        "tool.flwr.app": {"publisher": "fedvla", "fab-include": [f"{package}/**/*.py"]},
+        "tool.flwr.app.components": {
+            "serverapp": f"{package}.server_app:app", "clientapp": f"{package}.client_app:app",
+        },
+        "tool.flwr.app.config": to_run_config(Config()),
+    }  # fmt: skip
+    return "\n".join(f"[{name}]\n{_toml(values)}" for name, values in tables.items())
+
+
 def write_settings(folder: Path, config: Config) -> Path:
-    """Write ``folder/settings.toml`` for ``--run-config`` and return it: JSON's scalars are TOML's."""
+    """Write ``folder/settings.toml`` for ``--run-config`` and return it."""
     path = folder / "settings.toml"
-    path.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in to_run_config(config).items()))
+    path.write_text(_toml(to_run_config(config)))
     return path
+
+
+def _toml(values: dict[str, Any]) -> str:
+    """Return the lines of a table: JSON's scalars and lists of them are TOML's."""
+    return "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
 
 
 def absolute(config: Config) -> Config:

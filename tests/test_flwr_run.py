@@ -1,11 +1,19 @@
 """`flwr run` for real: a SuperLink, Flower's simulation runtime with its Ray workers, and this app."""
 
+import os
+import shutil
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from flwr.cli.build import build_fab_from_disk
+from flwr.cli.config_utils import load_and_validate
 from safetensors.numpy import load_file
 
 from fedvla_lib import engine, run_folder, superlink
@@ -63,3 +71,27 @@ def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path)
     assert not list(app.rglob("__pycache__"))
     settings = superlink.write_settings(tmp_path, tiny).read_text()
     assert from_run_config(tomllib.loads(settings)) == tiny
+
+
+@pytest.mark.unit
+def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
+    """As from a wheel: the package's folder and nothing beside it."""
+    package = PYPROJECT.parent / "fedvla_lib"
+    alone = shutil.copytree(package, tmp_path / "site/fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+    code = "import sys; from fedvla_lib import superlink; print(superlink.stage_app(superlink.Path(sys.argv[1])))"
+    environment = {**os.environ, "PYTHONPATH": str(alone.parent)}
+    command = [sys.executable, "-c", code, str(tmp_path / "stage")]
+    said = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+    app = Path(said.strip())
+    project, warnings = load_and_validate(app / "pyproject.toml")
+    ours = tomllib.loads(PYPROJECT.read_text())["tool"]["flwr"]["app"]
+    assert {**project["tool"]["flwr"]["app"], "fab-include": 0} == {**ours, "fab-include": 0} and not warnings
+    with ZipFile(BytesIO(build_fab_from_disk(app))) as bundle:
+        wanted = {f"fedvla_lib/{path.relative_to(package)}" for path in package.rglob("*.py")}
+        assert wanted <= set(bundle.namelist())
+
+
+@pytest.mark.unit
+def test_a_strangers_project_file_beside_the_package_is_not_taken(tmp_path):
+    (tmp_path / "pyproject.toml").write_text('[project]\nname = "another"\n')
+    assert not superlink._is_checkout(tmp_path) and superlink._is_checkout(PYPROJECT.parent)
