@@ -1,6 +1,5 @@
 """Who takes part: Flower's nodes have random ids, ours hold partitions, and one question per run tells which."""
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -11,11 +10,16 @@ from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from fedvla_lib.params import ParameterError
-from fedvla_lib.spec import ACTION_KEY, STATE_KEY
+from fedvla_lib.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.wire import NOTE, Stats, unpack_stats
 
 # Called with (round, who, kind, values) for everything worth keeping; a run folder's `log` fits.
 Report = Callable[[int, str, str, dict[str, Any]], None]
+
+MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # their lengths
+MOST_FRAMES = 2**40  # three thousand years of frames: keeps the sum of all counts in 64 bits, and is no other defence
+LARGEST = float(np.finfo(np.float32).max)  # policies normalise in float32; its square is still finite in float64
+ROUNDING = 1e-6  # of the largest value: how far a mean may lie outside its range
 
 
 class TooFewReplies(RuntimeError):
@@ -115,19 +119,58 @@ def answered(reply: Message | None) -> Message:
 def _introduction(reply: Message, others: Iterable[Introduction]) -> Introduction:
     note = answered(reply).content.config_records.get(NOTE, {})
     partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
-    if not isinstance(partition_id, int) or partition_id in {other.partition_id for other in others}:
+    taken = {other.partition_id for other in others}
+    if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
         raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
-    if not isinstance(num_examples, int) or num_examples <= 0:
-        raise ParameterError("examples", f"num-examples={num_examples!r}: expected training frames above 0")
-    return Introduction(partition_id, num_examples, _statistics(note.get("stats")))
+    if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
+        text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
+        raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
+    try:
+        return Introduction(partition_id, num_examples, _statistics(note.get("stats"), num_examples))
+    except ParameterError as error:
+        raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
 
 
-def _statistics(text: Any) -> Stats:
+def _statistics(text: Any, num_examples: int) -> Stats:
+    """Return a client's statistics if they can be pooled with those of others.
+
+    Raises:
+        ParameterError: what is wrong, in one line.
+    """
+    if not isinstance(text, str):
+        raise ParameterError("statistics", f"statistics are no text but {type(text).__name__}")
     try:
         stats = unpack_stats(text)
-        usable = all(np.isfinite(stats[key][name]).all() for key in (STATE_KEY, ACTION_KEY) for name in ("mean", "std"))
-    except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
+    # A text that is no JSON or ragged, one of another structure, one nested too deep.
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ParameterError("statistics", f"statistics cannot be read: {error!r}") from error
-    if not usable:
-        raise ParameterError("statistics", "statistics hold values that are not finite")
+    _check_keys("statistics", stats, (STATE_KEY, ACTION_KEY))
+    for key, of_feature in stats.items():
+        _check_keys(key, of_feature, MEASURES)
+        _check_measures(key, of_feature)
+        if of_feature["count"][0] != num_examples:
+            count = int(of_feature["count"][0])
+            raise ParameterError("examples", f"{key} counts {count} frames, but num-examples={num_examples}")
     return stats
+
+
+def _check_keys(what: str, found: Iterable[str], expected: Iterable[str]) -> None:
+    if set(found) != set(expected):
+        raise ParameterError("statistics", f"{what}: got {sorted(found)}, expected {sorted(expected)}")
+
+
+def _check_measures(key: str, measures: dict[str, np.ndarray]) -> None:
+    """Return if the measures of one feature are numbers that some frames could have."""
+    for name, length in MEASURES.items():
+        value, kind = measures[name], "i" if name == "count" else "f"
+        if value.dtype.kind != kind or value.shape != (length,):
+            found = f"{value.dtype} {value.shape}"
+            raise ParameterError("statistics", f"{key}.{name} is {found}, expected {length} numbers")
+        if not (np.abs(value) <= LARGEST).all():  # NaN is not smaller either
+            raise ParameterError("statistics", f"{key}.{name} holds values that are not finite in float32")
+    mean, lowest, highest = measures["mean"], measures["min"], measures["max"]
+    if (measures["std"] < 0).any():
+        raise ParameterError("statistics", f"{key}.std is below 0")
+    slack = ROUNDING * np.maximum(np.abs(lowest), np.abs(highest))
+    if (lowest > highest).any() or (mean < lowest - slack).any() or (mean > highest + slack).any():
+        raise ParameterError("statistics", f"{key}: a mean lies outside its min and max")

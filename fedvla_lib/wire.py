@@ -5,7 +5,9 @@ Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``n
 SCAFFOLD adds ``control`` both ways: control variates, checked as the arrays are.
 """
 
+import io
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +36,8 @@ PROXIMAL_MU = "proximal-mu"  # Flower's own key
 DATA = "data"  # in a node's config: the data set that is this client's own
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"
-ROLLOUT_NAME = re.compile(r"rollout_\w+\.(mp4|npz)", re.ASCII)
+ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # no longer than file systems take
+NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 # The numbers of a reply, all of them and no others: Flower averages records with equal keys only.
 TRAIN_METRICS = (EXAMPLES, "loss", "seconds")
@@ -135,10 +138,14 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     try:
         rows = json.loads(answer["rollouts"])
         files = dict(zip(answer["file-names"], answer["files"], strict=True))
-        usable = all(isinstance(row, dict) and row["video"] in files for row in rows)
-    except (KeyError, TypeError, ValueError) as error:
+        flat = not any(isinstance(value, dict | list) for row in rows for value in row.values())
+        usable = flat and all(row["video"] in files for row in rows)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ParameterError("rollouts", f"rollouts cannot be read: {error!r}") from error
-    bad = [name for name, file in files.items() if not ROLLOUT_NAME.fullmatch(name) or not isinstance(file, bytes)]
+    bad = [
+        name for name, file in files.items()
+        if not isinstance(name, str) or not ROLLOUT_NAME.fullmatch(name) or not isinstance(file, bytes)
+    ]  # fmt: skip
     if bad or not usable:
         raise ParameterError("rollouts", f"expected files rollout_<timestamp>....mp4 or .npz, got {sorted(files)}")
     return Rollouts(rows, files)
@@ -150,7 +157,30 @@ def note(**values: Any) -> ConfigRecord:
 
 
 def _decode(name: str, array: Array) -> np.ndarray:
+    """Return one array of a record, once its bytes are known to be a .npy of numbers and as long as they claim."""
     try:
+        _check_npy(name, array)
         return array.numpy()
-    except (ValueError, TypeError, EOFError, OSError) as error:
+    except ParameterError:
+        raise
+    # NumPy hands a header to Python's parser, which fails in a dozen ways; each is the client's, none may end the run.
+    except Exception as error:
         raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
+
+
+def _check_npy(name: str, array: Array) -> None:
+    """Compare the header with what was declared and with the bytes there are, before anything is allocated.
+
+    NumPy alone would open an archive, or set memory aside for as many numbers as the header claims.
+    """
+    file = io.BytesIO(array.data)
+    version = np.lib.format.read_magic(file)
+    if version not in NPY_HEADERS:
+        raise ValueError(f".npy version {version}, expected one of {sorted(NPY_HEADERS)}")
+    shape, _, dtype = NPY_HEADERS[version](file)
+    if dtype.kind not in "biufc" or str(dtype) != array.dtype:
+        raise ParameterError("dtype", f"array {name!r} holds {dtype}, expected numbers, as declared {array.dtype!r}")
+    if shape != tuple(array.shape):
+        raise ParameterError("shape", f"array {name!r} has shape {shape}, declared was {tuple(array.shape)}")
+    if (wanted := math.prod(shape) * dtype.itemsize) != (found := len(array.data) - file.tell()):
+        raise ParameterError("shape", f"array {name!r} of shape {shape} takes {wanted} bytes, {found} came")

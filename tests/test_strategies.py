@@ -2,16 +2,18 @@
 
 import hashlib
 import io
+import json
+import pickle
 
 import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
-from fedvla_lib import strategies, wire
+from fedvla_lib import data, strategies, wire
 from fedvla_lib.config import Config
 from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
-from fedvla_lib.params import digest, shapes_of
+from fedvla_lib.params import ParameterError, digest, shapes_of
 from fedvla_lib.roster import Roster, TooFewReplies, call, wait_for_nodes
 from fedvla_lib.strategies import CheckedFedAvg
 
@@ -153,7 +155,26 @@ def _raise():
 
 
 GOOD = random_arrays(1)
-UNDECODABLE = ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array("float32", (3,), "numpy.ndarray", b"not an array")})
+
+
+def _with_bias(content, dtype="float32", shape=(3,)):
+    """A good reply but for the bytes of one array."""
+    record = ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array(dtype, shape, "numpy.ndarray", content)})
+    return {**reply_content(GOOD), wire.ARRAYS: record}
+
+
+def _npz():
+    buffer = io.BytesIO()
+    np.savez(buffer, bias=GOOD["bias"])
+    return buffer.getvalue()
+
+
+def _npy(header, rest=b"\0" * 12):
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + rest
+
+
+def _claiming(shape, descr="<f4"):
+    return _npy(f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}}}\n")
 
 
 class Trap:
@@ -166,7 +187,10 @@ class Trap:
 def _pickled():
     buffer = io.BytesIO()
     np.save(buffer, np.array([Trap()], dtype=object), allow_pickle=True)
-    return ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array("object", (1,), "numpy.ndarray", buffer.getvalue())})
+    return buffer.getvalue()
+
+
+HUGE = (10**12,)
 
 
 FAULTS = {
@@ -175,8 +199,21 @@ FAULTS = {
     "renamed array": ("names", lambda: reply_content({("W" if n == "weight" else n): a for n, a in GOOD.items()})),
     "missing array": ("names", lambda: reply_content(_without(GOOD, "gain"))),
     "wrong dtype": ("dtype", lambda: reply_content({n: a.astype(np.float64) for n, a in GOOD.items()})),
-    "undecodable bytes": ("dtype", lambda: {**reply_content(GOOD), wire.ARRAYS: UNDECODABLE}),
-    "a pickle": ("dtype", lambda: {**reply_content(GOOD), wire.ARRAYS: _pickled()}),
+    "undecodable bytes": ("dtype", lambda: _with_bias(b"not an array")),
+    "a pickle": ("dtype", lambda: _with_bias(_pickled(), "object", (1,))),
+    "a bare pickle": ("dtype", lambda: _with_bias(pickle.dumps(Trap()))),
+    "an archive": ("dtype", lambda: _with_bias(_npz())),
+    "half an archive": ("dtype", lambda: _with_bias(b"PK\x03\x04 and no more")),
+    "no bytes": ("dtype", lambda: _with_bias(b"")),
+    "half a header": ("dtype", lambda: _with_bias(_claiming((3,))[:30])),
+    "a header that is no Python": ("dtype", lambda: _with_bias(_npy("{'descr': '<f4', 'shape': (3,)\0"))),
+    "a header too deep for Python": ("dtype", lambda: _with_bias(_npy("-" * 9000 + "1"))),
+    "more numbers than memory": ("shape", lambda: _with_bias(_claiming(HUGE))),
+    "declared so as well": ("shape", lambda: _with_bias(_claiming(HUGE), shape=HUGE)),
+    "more numbers than 64 bits": ("shape", lambda: _with_bias(_claiming((0, 10**30)))),
+    "numbers of no bytes": ("dtype", lambda: _with_bias(_claiming(HUGE, "<U0"), "<U0", HUGE)),
+    "another type than declared": ("dtype", lambda: _with_bias(_claiming((3,), "<i4"))),
+    "bytes too many": ("shape", lambda: _with_bias(_claiming((3,)) + b"more")),
     "wrong hash": ("hash", lambda: {**reply_content(GOOD), wire.NOTE: wire.note(sha256=hashlib.sha256().hexdigest())}),
     "no hash": ("hash", lambda: _without(reply_content(GOOD), wire.NOTE)),
     "no arrays": ("names", lambda: _without(reply_content(GOOD), wire.ARRAYS)),
@@ -333,17 +370,97 @@ def test_messages_carry_the_hash_that_clients_check():
     assert checked == [digest(GOOD)] * 2
 
 
-def introducing(partition_of) -> ClientApp:
+def statistics(count, **changed):
+    """What a client with these frames might send; `changed` measures replace the action's."""
+    good = {"mean": np.zeros(6), "std": np.ones(6), "min": -np.ones(6), "max": np.ones(6), "count": np.array([count])}
+    return {"observation.state": good, "action": {**good, **changed}}
+
+
+def introducing(partition_of, stats_of=lambda k, frames: wire.pack_stats(statistics(frames)), **said) -> ClientApp:
+    """A ClientApp whose introduction is good, but for `said` of the node of partition 1."""
     app = ClientApp()
-    stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in ("observation.state", "action")}
 
     @app.query()
     def query(message, context):
         k = context.node_config["partition-id"]
-        note = wire.note(partition_id=partition_of[k], num_examples=5 + k, stats=wire.pack_stats(stats))
-        return Message(RecordDict({wire.NOTE: note}), reply_to=message)
+        values = {"partition_id": partition_of[k], "num_examples": 5 + k, "stats": stats_of(k, 5 + k)}
+        return Message(RecordDict({wire.NOTE: wire.note(**values | (said if k == 1 else {}))}), reply_to=message)
 
     return app
+
+
+def _without_measure(name):
+    return json.dumps({key: _without(of, name) for key, of in json.loads(wire.pack_stats(statistics(6))).items()})
+
+
+def _action(**changed):
+    """Statistics whose action is changed; values may be what NumPy would not write."""
+    stats = json.loads(wire.pack_stats(statistics(6)))
+    return json.dumps({**stats, "action": stats["action"] | changed})
+
+
+INTRODUCTIONS = {
+    "ragged": ("statistics", {"stats": _action(mean=[[0.0], [0.0, 1.0]])}),
+    "not UTF-8": ("statistics", {"stats": b"\xff\xfe{}"}),
+    "no JSON": ("statistics", {"stats": "{'mean': 0}"}),
+    "too deep": ("statistics", {"stats": "[" * 100_000}),
+    "too deep in a measure": ("statistics", {"stats": _action(mean=0.0).replace("0.0", "[" * 900 + "]" * 900, 1)}),
+    "a list": ("statistics", {"stats": "[]"}),
+    "a number": ("statistics", {"stats": 3.0}),
+    "nothing": ("statistics", {"stats": ""}),
+    "no count": ("statistics", {"stats": _without_measure("count")}),
+    "no min": ("statistics", {"stats": _without_measure("min")}),
+    "no action": ("statistics", {"stats": json.dumps(_without(json.loads(_action()), "action"))}),
+    "five joints": ("statistics", {"stats": _action(mean=[0.0] * 5)}),
+    "two counts": ("statistics", {"stats": _action(count=[6, 6])}),
+    "a bare count": ("statistics", {"stats": _action(count=6)}),
+    "negative std": ("statistics", {"stats": _action(std=[-1.0] * 6)}),
+    "NaN": ("statistics", {"stats": _action(mean=[float("nan")] * 6)}),
+    "infinite": ("statistics", {"stats": _action(max=[float("inf")] * 6)}),
+    "its square is infinite": ("statistics", {"stats": _action(std=[1e300] * 6)}),
+    "words": ("statistics", {"stats": _action(mean=["a lot"] * 6)}),
+    "a mean out of range": ("statistics", {"stats": _action(mean=[7.0] * 6)}),
+    "min above max": ("statistics", {"stats": _action(min=[2.0] * 6)}),
+    "negative count": ("examples", {"stats": _action(count=[-6])}),
+    "half a frame": ("statistics", {"stats": _action(count=[6.5])}),
+    "a count beyond 64 bits": ("statistics", {"stats": _action(count=[10**30])}),
+    "another count than num-examples": ("examples", {"stats": _action(count=[7])}),
+    "another num-examples than its count": ("examples", {"num_examples": 10**9}),
+    "extra measure": ("statistics", {"stats": _action(median=[0.0] * 6)}),
+    "extra feature": ("statistics", {"stats": json.dumps({**json.loads(_action()), "gaze": {}})}),
+    "more frames than anyone has": ("examples", {"num_examples": 2**62}),
+    "frames that are true": ("examples", {"num_examples": True}),
+    "negative partition": ("partition", {"partition_id": -1}),
+    "a partition that is true": ("partition", {"partition_id": True}),
+}
+
+
+@pytest.mark.parametrize("fault", INTRODUCTIONS)
+def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled(fault):
+    reason, said = INTRODUCTIONS[fault]
+    events = Events()
+    grid = InlineGrid(introducing([0, 1, 2], **said), 3, {})
+    roster, introductions = call(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
+    assert [one.partition_id for one in introductions] == [0, 2] and sorted(roster.partition_of.values()) == [0, 2]
+    assert events.rejected() == {f"node_{FIRST_NODE_ID + 1}": reason}
+    detail = events[0][3]["detail"]
+    assert "\n" not in detail and (reason == "partition" or detail.startswith("client_1: "))
+    pooled = data.pool_stats([one.stats for one in introductions])
+    assert pooled["action"]["count"].tolist() == [5 + 7]
+    np.testing.assert_array_equal(pooled["action"]["std"], np.ones(6))
+
+
+@pytest.mark.parametrize("value", [0.1, -7e-30, 1e30])
+def test_joints_that_never_move_can_be_pooled(value):
+    """Rounding puts the mean of equal numbers a little beside them."""
+
+    def stats_of(k, frames):
+        measured = data._describe(np.full((frames, 6), value, np.float32))
+        return wire.pack_stats({"observation.state": measured, "action": measured})
+
+    events = Events()
+    grid = InlineGrid(introducing(range(60), stats_of), 60, {})
+    assert len(call(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0)[1]) == 60 and not events
 
 
 def test_roll_call_orders_by_partition_and_rejects_a_double():
@@ -366,3 +483,18 @@ def test_a_client_cannot_choose_where_the_server_writes(name):
     note = wire.note(rollouts="[]", file_names=[name], files=[b"x"])
     with pytest.raises(ValueError, match="expected files rollout_"):
         wire.unpack_rollouts(RecordDict({wire.NOTE: note}))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"rollouts": "[" * 100_000}, {"rollouts": '[{"video": "rollout_1.mp4", "rows": [[]]}]'}, {"rollouts": "[3]"},
+        {"file_names": [3]}, {"file_names": 3}, {"file_names": [f"rollout_{'x' * 300}.mp4"]}, {"files": ["text"]},
+    ],
+    ids=["too deep", "nested", "numbers", "numbered files", "a number", "longer than a file's name", "text for bytes"],
+)  # fmt: skip
+def test_rollouts_that_cannot_be_kept_are_refused(said):
+    good = {"rollouts": '[{"video": "rollout_1.mp4"}]', "file_names": ["rollout_1.mp4"], "files": [b"x"]}
+    wire.unpack_rollouts(RecordDict({wire.NOTE: wire.note(**good)}))
+    with pytest.raises(ParameterError, match="rollout"):
+        wire.unpack_rollouts(RecordDict({wire.NOTE: wire.note(**good | said)}))
