@@ -101,6 +101,7 @@ lab: $(STAMP)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
+	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md book/*.md notebooks/*.ipynb
 
 # Coverage counts the tests alone. The chapters then run twice at the tiny profile: as their reader would run them (nbmake) and
 # with injected parameters (papermill); the second copies are what CI renders.
