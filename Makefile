@@ -2,7 +2,7 @@
 # make test   run everything that guards it                               make lab     open the notebooks
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
-# make zip    notebooks, results and library in one file
+# make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -10,7 +10,7 @@
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
 # share the test files; every one computes on one thread and takes 2 GB).
 .DEFAULT_GOAL := help
-.PHONY: help env book check-site data doctor test lint lab lock new-chapter zip clean
+.PHONY: help env book check-site data doctor test lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -92,6 +92,10 @@ check-site: $(STAMP)
 # What is attached to a release.
 zip: $(STAMP)
 	$(BIN)/python book/make_zip.py
+
+# Needs the executed chapters of `make book`, and the system's Chromium.
+pdf: $(STAMP)
+	$(BIN)/python book/make_pdf.py --profile $(FEDVLA_PROFILE)
 
 new-chapter: $(STAMP)
 	@$(BIN)/python book/new_chapter.py "$(NAME)"

@@ -1,4 +1,7 @@
-"""A Sphinx extension: no script that would fetch code from elsewhere, or twice, ends up on a page."""
+"""A Sphinx extension: no script that would fetch code from elsewhere, or twice, ends up on a page.
+
+It also lets a single page hold the whole book, to be printed.
+"""
 
 from typing import Any
 
@@ -13,11 +16,22 @@ def without_unused(app: Sphinx, page: str, template: str, context: dict[str, Any
         context[kind] = [file for file in context.get(kind, []) if UNUSED not in _text(file)]
 
 
+def complete_single_page(app: Sphinx) -> None:
+    """Let the single page show all that pages show.
+
+    Sphinx takes what extensions say about HTML for a single page too, unless one of them names the single page, as
+    sphinx-exercise does: then the others' nodes, such as drop-downs, are unknown there.
+    """
+    handlers = app.registry.translation_handlers
+    handlers["singlehtml"] = {**handlers.get("html", {}), **handlers.get("singlehtml", {})}
+
+
 def _text(file: Any) -> str:
     return f"{file} {getattr(file, 'filename', '')} {getattr(file, 'attributes', {}).get('body', '')}".lower()
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Connect to Sphinx, behind those who add scripts."""
+    """Connect to Sphinx, behind those who add scripts and nodes."""
     app.connect("html-page-context", without_unused, priority=900)
+    app.connect("builder-inited", complete_single_page)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
