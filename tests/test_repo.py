@@ -64,9 +64,9 @@ def test_lock_satisfies_the_declared_ranges():
 
 
 def test_readme_commands_exist():
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
-    for page in ["README.md", *(f"book/{name}.md" for name in ("index", "setup", "how_to_read"))]:
-        used = set(re.findall(r"(?:^|[`\s])make ([a-z]+)", code_of(page), flags=re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    for page in ["README.md", "CONTRIBUTING.md", *(f"book/{name}.md" for name in ("index", "setup", "how_to_read"))]:
+        used = set(re.findall(r"(?:^|[`\s])make ([a-z-]+)", code_of(page), flags=re.MULTILINE))
         assert used <= targets, f"{page} names {sorted(used - targets)}"
 
 
