@@ -278,6 +278,32 @@ def test_a_client_cannot_buy_weight_with_more_examples_than_it_came_with():
     np.testing.assert_allclose(averaged["weight"], expected, rtol=1e-6, atol=1e-7)
 
 
+def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
+    """A client that announced a thousand million frames from the start, and moves the other way."""
+    start, wanted = random_arrays(99), random_arrays(98)
+
+    def moved(k, _):
+        noise = random_arrays(k, scale=0.2)
+        factor, examples = (-5.0, 10**9) if k == 0 else (1.0, 10)
+        arrays = {name: start[name] + np.float32(factor) * (wanted[name] + noise[name]) for name in SHAPES}
+        return reply_content(arrays, examples)
+
+    length, limit = float(np.linalg.norm(flat(wanted))), 0.5
+
+    def movement(**settings):
+        arrays, _, events = one_round(answering(moved), 10, start=start, config=Config(**settings))
+        assert not events.rejected()
+        return (flat(arrays) - flat(start)) / length, flat(wanted) / length
+
+    for strategy in ("fedmedian", "krum"):
+        went, should = movement(strategy=strategy)
+        assert np.linalg.norm(went - should) < 0.5
+    went, should = movement(clip_norm=limit * length)
+    assert went @ should < 0 and np.linalg.norm(went) < 1.001 * limit  # where it says, but no further
+    went, should = movement()
+    assert went @ should < -4
+
+
 def test_clipping_shortens_a_movement_and_keeps_its_direction():
     start, far = random_arrays(99), random_arrays(99)
     far = {name: array + 50 for name, array in far.items()}
