@@ -11,7 +11,8 @@
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,15 +36,29 @@ class Checkpoint:
     clients: Arrays
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Make of the error of safetensors at a full disk, which is no OSError, one that names the file to be written."""
+    try:
+        yield
+    except SafetensorError as error:
+        raise OSError(f"cannot write {path}: {error}") from error
+
+
 def save(root: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint into the run folder, whole or not at all, and remove those before the last two."""
+    """Write a checkpoint into the run folder, whole or not at all, and remove those before the last two.
+
+    Raises:
+        OSError: it cannot be written; the message names the file.
+    """
     folder = root / "checkpoints" / f"round_{checkpoint.round}"
     scratch = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         scratch.mkdir(parents=True)
         for part in PARTS:
-            save_file(getattr(checkpoint, part), scratch / f"{part}.safetensors")
+            with writing(folder / f"{part}.safetensors"):
+                save_file(getattr(checkpoint, part), scratch / f"{part}.safetensors")
         shutil.rmtree(folder, ignore_errors=True)
         os.replace(scratch, folder)
     finally:

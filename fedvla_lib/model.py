@@ -29,6 +29,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from safetensors import safe_open
 
+from fedvla_lib.checkpoint import writing
 from fedvla_lib.config import Config, cache_dir, granted_threads, personal_parts
 from fedvla_lib.lora import add_adapters, merged
 from fedvla_lib.nano import ensure_nano
@@ -163,12 +164,13 @@ def save_policy(bundle: Bundle, folder: Path) -> None:
 
     Raises:
         FileExistsError: `folder` is there already; nothing is overwritten.
+        OSError: it cannot be written; the message names it.
     """
     folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists already: a saved policy is never overwritten")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch:
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch, writing(folder):
         target = Path(scratch) / "policy"
         merged(bundle.policy).save_pretrained(target)
         bundle.preprocess.save_pretrained(target)

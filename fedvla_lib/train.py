@@ -22,6 +22,7 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 from safetensors.torch import load_file, save_file
 from tqdm.auto import tqdm
 
+from fedvla_lib.checkpoint import writing
 from fedvla_lib.config import Config, granted_threads
 from fedvla_lib.corrections import Correction
 from fedvla_lib.model import Bundle, predict_chunk
@@ -263,7 +264,7 @@ def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[flo
     """Write ``step_NNNNNN`` whole or not at all: weights, optimiser, schedule, random state, losses."""
     target = folder / f"step_{len(losses):06d}"
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch, writing(target):
         made = Path(scratch) / "checkpoint"
         save_training_state(made, len(losses), optimizer, scheduler)
         weights = {name: p.detach().contiguous() for name, p in trainable(bundle.policy).items()}

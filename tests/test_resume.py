@@ -134,3 +134,29 @@ def test_a_checkpoint_is_whole_or_absent_and_only_the_last_two_stay(tmp_path, mo
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, Checkpoint(4, arrays, {}, {}))
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["round_2", "round_3"]
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from fedvla_lib import checkpoint
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+kept = {"w": np.zeros(100_000, np.float32)}
+try:
+    checkpoint.save(Path(sys.argv[1]), checkpoint.Checkpoint(1, {}, {}, kept))
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.unit
+def test_a_full_disk_is_an_error_of_one_line_that_names_the_file_and_leaves_the_checkpoint_before(tmp_path):
+    """In a process that may write no file of this size: what safetensors raises then is no OSError of its own."""
+    checkpoint.save(tmp_path, Checkpoint(0, {"w": np.ones(3, np.float32)}, {}, {}))
+    done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"cannot write {tmp_path}/checkpoints/round_1/clients.safetensors: ")
+    assert done.stdout.count("\n") == 1
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["round_0"]
+    assert checkpoint.load(tmp_path).round == 0
