@@ -11,7 +11,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
 from fedvla_lib.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
@@ -667,3 +669,106 @@ def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_ylabel("success rate")
     ax.legend(frameon=False)
     return ax
+
+
+def flow_film(
+    points: np.ndarray, times: Sequence[float], *, ylabel: str, goal: np.ndarray | None = None, hold: int = 3
+) -> np.ndarray:
+    """Draw `flow` as a film, uint8 (T, H, W, 3): each time stands `hold` frames, the plan at the end a second more."""
+    stills = [_flow_still(points, times, i, ylabel, goal) for i in range(len(points))]
+    return np.stack(stills)[np.repeat(np.arange(len(points)), [hold] * (len(points) - 1) + [hold + FPS])]
+
+
+def _flow_still(
+    points: np.ndarray, times: Sequence[float], now: int, ylabel: str, goal: np.ndarray | None
+) -> np.ndarray:
+    """One time in colour, the times before it in grey, on axes that stay the same for all."""
+    with plt.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.6), dpi=100, layout="constrained")
+        ax = figure.subplots()
+        steps = np.arange(1, points.shape[1] + 1)
+        ax.plot(steps, points[:now].T, color="#CCCCCC", linewidth=1)
+        if goal is not None:
+            ax.plot(steps, goal, "k--", label="demonstration")
+        ax.plot(steps, points[now], ".-", color=PALETTE[0], linewidth=2, label="chunk now")
+        everything = points if goal is None else np.vstack([points, goal])
+        pad = 0.05 * np.ptp(everything) or 1
+        ax.set_ylim(everything.min() - pad, everything.max() + pad)
+        ax.set_xlabel("step of the chunk")
+        ax.set_ylabel(ylabel)
+        ax.set_title(f"flow time t = {times[now]:.2f}", fontsize=10, loc="left")
+        ax.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+PARTS = {  # centre and width on a sheet of 10 x 7
+    "vision encoder": (1.5, 5.0, 2.5),
+    "connector (pixel shuffle + projection)": (1.5, 3.6, 2.5),
+    "state projection": (4.8, 5.0, 2.3),
+    "language model": (3.1, 2.0, 5.7),
+    "language head (unused by the policy)": (4.8, 0.5, 2.3),
+    "action input projection": (8.5, 5.0, 2.5),
+    "action-time MLP": (8.5, 3.6, 2.5),
+    "action expert": (8.5, 2.0, 2.5),
+    "action output projection": (8.5, 0.5, 2.5),
+}
+ARROWS = {  # from, to, where the label stands
+    "images": ((1.5, 6.3), (1.5, 5.45)),
+    "patches": ((1.5, 4.55), (1.5, 4.05)),
+    "image tokens": ((1.5, 3.15), (1.5, 2.45)),
+    "state": ((4.8, 6.3), (4.8, 5.45)),
+    "state token": ((4.8, 4.55), (4.8, 2.45)),
+    "words": ((1.5, 0.8), (1.5, 1.55)),
+    "keys, values": ((5.95, 2.0), (7.25, 2.0)),
+    "noisy actions": ((8.5, 6.3), (8.5, 5.45)),
+    "action tokens, flow time": ((8.5, 4.55), (8.5, 4.05)),
+    "suffix": ((8.5, 3.15), (8.5, 2.45)),
+    "expert tokens": ((8.5, 1.55), (8.5, 0.95)),
+    "velocity": ((8.5, 0.05), (8.5, -0.4)),
+}
+OUTSIDE = {"images": 6.7, "state": 6.7, "noisy actions": 6.7, "words": 0.4, "velocity": -0.75}  # what enters or leaves
+
+
+def architecture(table: pd.DataFrame, shapes: dict[str, Sequence[int]], *, ax: Axes | None = None) -> Axes:
+    """Draw SmolVLA's parts with their parameters, and the shape of what flows on each arrow.
+
+    Args:
+        table: columns part, parameters, trainable, as of `model.module_table`.
+        shapes: by arrow, as named in `ARROWS`; an arrow without a shape stays without one.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 6), layout="constrained")
+    for name, (start, end) in ARROWS.items():
+        ax.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": "black", "shrinkA": 0, "shrinkB": 0})
+        _arrow_label(ax, name, " × ".join(map(str, shapes.get(name, ()))))
+    for row in table.itertuples():
+        _part(ax, row.part, row.parameters, row.trainable)
+    for color, label in ((PALETTE[0], "trained"), ("#BBBBBB", "frozen")):
+        ax.plot([], [], "s", color=color, alpha=0.5, label=label)
+    ax.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, -0.04))
+    ax.set_xlim(0, 10)
+    ax.set_ylim(-1.3, 7.1)
+    ax.set_axis_off()
+    return ax
+
+
+def _part(ax: Axes, part: str, parameters: int, trainable: int) -> None:
+    """A box with the part's name and its number of parameters; a part that trains in some of them says in how many."""
+    x, y, width = PARTS[part]
+    color = PALETTE[0] if trainable else "#BBBBBB"
+    ax.add_patch(plt.Rectangle((x - width / 2, y - 0.45), width, 0.9, facecolor=color, alpha=0.5, edgecolor="black"))
+    name = part.replace(" (", "\n(").replace("pixel shuffle + ", "shuffle + ")
+    some = f" ({trainable:,} trained)" if 0 < trainable < parameters else ""
+    ax.text(x, y, f"{name}\n{parameters:,}{some}", ha="center", va="center", fontsize=8)
+
+
+def _arrow_label(ax: Axes, name: str, shape: str) -> None:
+    (x, y), (to_x, to_y) = ARROWS[name]
+    if name in OUTSIDE:
+        ax.text(x, OUTSIDE[name], f"{name}\n{shape}", ha="center", va="center", fontsize=8, color="#222222")
+    elif y == to_y:
+        ax.text((x + to_x) / 2, y + 0.1, f"{name}\n{shape}", ha="center", va="bottom", fontsize=7, color="#222222")
+    else:
+        ax.text(x + 0.12, (y + to_y) / 2, f"{name}\n{shape}", va="center", fontsize=7, color="#222222")

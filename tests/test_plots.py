@@ -173,6 +173,27 @@ def test_flow_draws_a_line_per_time_and_the_goal():
     assert labelled(ax)
 
 
+def test_the_film_of_a_flow_shows_each_time_and_holds_the_last():
+    points = np.arange(12.0).reshape(3, 4)
+    film = plots.flow_film(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4), hold=2)
+    assert film.dtype == np.uint8 and len(film) == 6 + plots.FPS and not any(side % 2 for side in film.shape[1:3])
+    assert (film[0] == film[1]).all() and (film[4] == film[-1]).all()
+    assert (film[1] != film[2]).any() and (film[3] != film[4]).any()
+
+
+def test_the_architecture_shows_every_count_and_shape_it_is_given():
+    counts = {part: 1_000 * (i + 1) for i, part in enumerate(plots.PARTS)}
+    table = pd.DataFrame({"part": counts.keys(), "parameters": counts.values(), "trainable": 0})
+    table.loc[table.part == "action expert", "trainable"] = 7
+    shapes = {name: (8, i, 99) for i, name in enumerate(plots.ARROWS)}
+    ax = plots.architecture(table, shapes)
+    words = "|".join(text.get_text() for text in ax.texts)
+    assert all(f"\n{count:,}" in words for count in counts.values()) and "(7 trained)" in words
+    assert all(f"{name}\n8 × {i} × 99" in words for i, name in enumerate(shapes))
+    trained = [patch.get_facecolor()[:3] == matplotlib.colors.to_rgb(plots.PALETTE[0]) for patch in ax.patches]
+    assert trained == [part == "action expert" for part in counts]
+
+
 def test_padding_rate_and_errors_are_labelled_and_drawn_as_given():
     masks = np.array([[False, True], [True, True]])
     ax = plots.padding(masks)
