@@ -162,7 +162,8 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
     """
     if rows.duplicated(["run", "task", "seed"]).any():
         raise ValueError("a training seed ran a (task, seed) twice: give the attempts of one arm and partition")
-    table = rows.astype({"success": float}).pivot(index="run", columns=["task", "seed"], values="success").sort_index(axis=1)
+    won = rows.astype({"success": float})
+    table = won.pivot(index="run", columns=["task", "seed"], values="success").sort_index(axis=1)
     if table.isna().any(axis=None):
         raise ValueError(f"training seeds {list(table.index[table.isna().any(axis=1)])} lack attempts of the others")
     return table
