@@ -608,7 +608,7 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
         color = PALETTE[i % len(PALETTE)]
         ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
     ax.set_yticks(range(len(arms)), arms)
-    ax.invert_yaxis()
+    ax.set_ylim(len(arms) - 0.5, -0.5)
     ax.set_xlim(-2, 102)
     ax.set_xlabel("success rate [%], 95 % interval")
     ax.set_ylabel(ylabel)
