@@ -26,10 +26,17 @@ import papermill
 import yaml
 from papermill.exceptions import PapermillExecutionError
 
+from fedvla_lib import results
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
 RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
+FRONT_PAGE = "book/index.md"
+HEADLINE = b"<!-- headline -->"  # on the front page: what the comparison found takes this line's place
+COMPARISON = "book/reference/comparison"
+TOLD_BY = {"fedavg-200x2x2": "the federated model", "centralized": "training on all demonstrations in one place",
+           "local-only": "a lab on its own"}  # fmt: skip
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
 TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
 # Pages that end with results of benchmarks that were kept.
@@ -228,6 +235,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
+    if HEADLINE in wanted.get(Path(FRONT_PAGE), b""):
+        wanted[Path(FRONT_PAGE)] = wanted[Path(FRONT_PAGE)].replace(HEADLINE, _headline(root / COMPARISON).encode())
     for page, names in RESULTS_ON.items():
         if Path(page) in wanted:
             wanted[Path(page)] += _benchmark_tables([root / BENCHMARKS / f"{name}.json" for name in names]).encode()
@@ -262,6 +271,30 @@ def _times_table(chapters: list[Chapter], profile: str) -> str:
     total = sum(chapter.seconds for chapter in chapters)
     head = f"\nProfile `{profile}`, {os.cpu_count()} cores.\n\n| chapter | seconds |\n|---|---:|\n"
     return head + "\n".join([*rows, f"| **together** | **{total:.0f}** |"]) + "\n"
+
+
+def _headline(comparison: Path) -> str:
+    """What the stored comparison says of federated training with one task a client, in two sentences."""
+    rows = results.read_results(comparison)
+    rows = rows[(rows.partition == "task") & rows.arm.isin(TOLD_BY)]
+    of_arm = results.summary(rows).set_index("arm")
+    rates = ", ".join(
+        f"{who} {_points(100 * of_arm.success_rate[arm], 100 * of_arm.low[arm], 100 * of_arm.high[arm], ' %')}"
+        for arm, who in TOLD_BY.items()
+    )
+    federated, pooled, _ = TOLD_BY
+    (found,) = results.differences(rows, [(federated, pooled)], seed=0).itertuples()
+    gap = _points(100 * found.difference, 100 * found.low, 100 * found.high, " points")
+    seeds, attempts = of_arm.seeds[federated], of_arm.attempts[federated]
+    return (
+        f"**What comes out.** Ten labs with one task each of three, {attempts:,} attempts over {seeds} training seeds, "
+        f"equal gradient steps: {rates}. Federated minus pooled is {gap}; brackets are 95 % intervals, and "
+        "{doc}`/notebooks/06_federated_vs_centralized` says how they were made."
+    )
+
+
+def _points(value: float, low: float, high: float, unit: str) -> str:
+    return f"{value:.1f}{unit} [{low:.1f}, {high:.1f}]"
 
 
 def _card_tables(account: dict) -> str:

@@ -8,6 +8,8 @@ import pytest
 import yaml
 from build_book import BookError, Chapter
 
+from fedvla_lib import results
+
 ROOT = Path(__file__).parent.parent
 CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"
 
@@ -204,3 +206,13 @@ def test_warnings_of_the_book_are_errors(project, capfd):
     with pytest.raises(BookError, match="built strictly"):
         build_book.render(source, project / "_build" / "tiny")
     assert "nowhere" in capfd.readouterr().err
+
+
+@pytest.mark.unit
+def test_the_front_page_says_what_the_stored_comparison_found():
+    rows = results.read_results(ROOT / build_book.COMPARISON)
+    rows = rows[(rows.partition == "task") & (rows.arm == "fedavg-200x2x2")]
+    said = build_book._headline(ROOT / build_book.COMPARISON)
+    assert f"the federated model {100 * rows.success.mean():.1f} % [" in said
+    assert f"{len(rows):,} attempts over {rows.run.nunique()} training seeds" in said
+    assert build_book.HEADLINE in (ROOT / build_book.FRONT_PAGE).read_bytes()
