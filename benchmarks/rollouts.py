@@ -1,9 +1,9 @@
 """Closed-loop rollouts per minute: this library against lerobot-eval, same policy, same environment, same seeds.
 
-Both sides drive 16 arms at a time, film what they do (lerobot-eval the first ten attempts, this library all of them),
-and draw the same noise: the policy's look number k at a scene has the k-th draw of one generator, whatever the seed of
-the scene, so that the same attempts should succeed. lerobot-eval is measured twice: on one core like this library, with
-its environments in its own process, and as it comes, with a process for each environment on all cores.
+Both sides drive 16 arms at a time, film the first ten attempts (lerobot-eval cannot be told otherwise) and draw the
+same noise: the policy's look number k at a scene has the k-th draw of one generator, whatever the seed of the scene, so
+that the same attempts should succeed. lerobot-eval is measured twice: on one core like this library, with its
+environments in its own process, and as it comes, with a process for each environment on all cores.
 
     python benchmarks/rollouts.py --policy outputs/DATE_TIME/global_model/round_8
 """
@@ -24,6 +24,7 @@ from fedvla_lib import evaluate, model
 from fedvla_lib.config import Config
 from fedvla_lib.evaluate import FIRST_SEED
 
+FILMS = 10  # what lerobot-eval films, whatever it is told
 AS_LEROBOT = "as-lerobot-eval"  # first argument with which this script calls itself to run lerobot-eval
 
 
@@ -32,7 +33,7 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--policy", type=Path, required=True, help="a saved policy")
     parser.add_argument("--task", default="lift", help="the task")
-    parser.add_argument("--rollouts", type=int, default=32, help="attempts of each side")
+    parser.add_argument("--rollouts", type=int, default=96, help="attempts of each side")
     parser.add_argument("--batch", type=int, default=evaluate.AT_ONCE, help="environments lerobot-eval runs at once")
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
@@ -73,7 +74,7 @@ def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
     actor = SameNoise(model.load_policy(config))
     with tempfile.TemporaryDirectory() as films:
         return evaluate.evaluate(
-            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), progress=False
+            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), films=FILMS, progress=False
         )
 
 

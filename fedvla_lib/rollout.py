@@ -59,6 +59,9 @@ def run_episodes(
 ) -> list[Episode]:
     """Run an episode in each environment, all in step, so that a model can choose for all of them at once.
 
+    An environment without cameras draws only when its actor looks at ``observation["pixels"]``, which a policy does
+    once a chunk; its episode keeps no pictures.
+
     Args:
         envs: one environment, `actors` one actor and `seeds` one seed for each episode.
         together: chooses the actions of those that are not done yet.
@@ -71,12 +74,26 @@ def run_episodes(
     return [course.episode() for course in courses]
 
 
+class _Glance(dict):
+    """An observation whose pictures are drawn when they are first asked for, of the scene as it then stands."""
+
+    def __init__(self, observation: Observation, env: "So100Env") -> None:
+        super().__init__(observation)
+        self._env = env
+
+    def __missing__(self, key: str) -> dict[str, np.ndarray]:
+        if key != "pixels":
+            raise KeyError(key)
+        self[key] = self._env.pictures()
+        return self[key]
+
+
 class _Course:
     """An episode on its way."""
 
     def __init__(self, env: "So100Env", actor: Actor, seed: int) -> None:
         self.env, self.actor, self.seed = env, actor, seed
-        self.observation, _ = env.reset(seed=seed)
+        self.observation = self._shown(env.reset(seed=seed)[0])
         actor.reset(env, seed)
         self.over = self._success = False
         self._seen: list[Observation] = []
@@ -85,8 +102,13 @@ class _Course:
     def step(self, action: np.ndarray) -> None:
         self._seen.append(self.observation)
         self._actions.append(action)
-        self.observation, _, terminated, truncated, info = self.env.step(action)
+        observation, _, terminated, truncated, info = self.env.step(action)
+        self.observation = self._shown(observation)
         self.over, self._success = terminated or truncated, bool(info["is_success"])
+
+    def _shown(self, observation: Observation) -> Observation:
+        sim = self.env.unwrapped
+        return observation if sim.cameras else _Glance(observation, sim)
 
     def episode(self) -> Episode:
         sim = self.env.unwrapped

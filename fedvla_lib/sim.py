@@ -14,6 +14,7 @@ gripper down. The closed and open ends of the gripper are the ends of its joint'
 import atexit
 import os
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,7 +48,8 @@ class So100Env(gymnasium.Env):
         task: a name from `tasks.ALL_TASKS`, or a task of your own.
         image_size: side of the square camera images in pixels.
         render_mode: ``"rgb_array"`` or None; `render` returns all cameras side by side.
-        cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time.
+        cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time. What
+            `pictures` returns does not depend on it.
         lab: the place: camera poses, light, colours, calibration of the arm.
         screen: draw with this environment's renderer, which costs more to open than to use; it must show the same task
             at the same size, and stay open.
@@ -165,11 +167,15 @@ class So100Env(gymnasium.Env):
         self._needs_reset = terminated or truncated
         return self._observation(), float(terminated), terminated, truncated, self._info()
 
+    def pictures(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
+        """Draw the scene as it stands: camera -> uint8 (size, size, 3)."""
+        return {camera: self._draw(camera) for camera in cameras}
+
     def render(self) -> np.ndarray | None:
         """Return all cameras side by side, uint8 (size, 2 * size, 3); None without a render mode."""
         if self.render_mode is None:
             return None
-        return np.hstack([self._draw(camera) for camera in CAMERAS])
+        return np.hstack(list(self.pictures().values()))
 
     def close(self) -> None:
         """Free the renderer; the other environments of the process keep theirs."""
@@ -237,7 +243,7 @@ class So100Env(gymnasium.Env):
     def _observation(self) -> Observation:
         observation: Observation = {"agent_pos": self.joints}
         if self.cameras:
-            observation["pixels"] = {camera: self._draw(camera) for camera in self.cameras}
+            observation["pixels"] = self.pictures(self.cameras)
         return observation
 
     def _info(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fedvla_lib.evaluate import evaluate
 from fedvla_lib.expert import Expert
 from fedvla_lib.rollout import run_episode
 from fedvla_lib.sim import HOME, So100Env
@@ -24,6 +25,20 @@ class Stubborn:
     def act(self, observation):
         self.seen.append(observation)
         return self.target
+
+
+class Glancer(Expert):
+    """An expert that looks up at every eighth step, as a policy does at each chunk."""
+
+    def reset(self, env, seed):
+        super().reset(env, seed)
+        self.steps, self.looks = 0, []
+
+    def act(self, observation):
+        if self.steps % 8 == 0:
+            self.looks.append(observation["pixels"])
+        self.steps += 1
+        return super().act(observation)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +80,33 @@ def test_same_seed_same_episode_with_or_without_pictures(env):
         np.testing.assert_array_equal(one.actions, other.actions)
     np.testing.assert_array_equal(one.images["front"], again.images["front"])
     assert unseen.images == {}
+
+
+def test_without_cameras_an_actor_sees_the_moment_at_which_it_looks(env):
+    actor = Glancer()
+    blind = run_episode(So100Env("lift", SIZE, cameras=()), actor, seed=3)
+    filmed = run_episode(env, Expert(), seed=3)
+    np.testing.assert_array_equal(blind.actions, filmed.actions)
+    assert blind.images == {} and len(actor.looks) == -(-filmed.num_frames // 8)
+    for look, pictures in enumerate(actor.looks):
+        for camera in CAMERAS:
+            np.testing.assert_array_equal(pictures[camera], filmed.images[camera][8 * look])
+
+
+def test_what_is_not_filmed_is_drawn_only_where_the_actor_looks_and_ends_the_same(tmp_path, monkeypatch):
+    drawn, draw = [], So100Env.pictures
+    monkeypatch.setattr(So100Env, "pictures", lambda sim, *names: drawn.append(sim) or draw(sim, *names))
+    whole = evaluate(Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "all", progress=False)
+    some = evaluate(
+        Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "first", films=1, progress=False
+    )
+    drawn.clear()
+    none = evaluate(Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, progress=False)
+    assert [row["video"] is None for row in some] == [False, True, False, True]
+    assert len(list((tmp_path / "first").glob("*.mp4"))) == 2
+    for rows in (some, none):
+        assert [row | {"video": None} for row in rows] == [row | {"video": None} for row in whole]
+    assert len(drawn) == sum(-(-row["steps"] // 8) for row in none)
 
 
 def test_replaying_the_actions_repeats_the_episode(env):
