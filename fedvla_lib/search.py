@@ -16,13 +16,15 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from fedvla_lib import arms, clients, run_folder
-from fedvla_lib.config import Config, check
+from fedvla_lib.config import Config, check, code_digest
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.experiment import QUIET, with_recording
 from fedvla_lib.model import Bundle
 from fedvla_lib.roster import TooFewReplies, draw_size
 
-ROLLOUTS_FROM = 3_000_000  # apart from the seeds of chapters and experiments
+# Not those of chapters; of the stored experiments comparison.toml and normalisation.toml have the same. Trials make no
+# attempts, so none has chosen by them.
+ROLLOUTS_FROM = 3_000_000
 LOCAL_STEPS = (1, 2, 5, 10, 20)
 # A client whose loss is not finite raises, and the server gives up when too few replies can be used.
 DIVERGED = (FloatingPointError, TooFewReplies)
@@ -61,12 +63,14 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
     )  # fmt: skip
     if not study.get_trials(states=[TrialState.COMPLETE]):
         raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
+    ended = {"status": "completed", "code": code_digest(*arms.TRAINED_BY)}
     found = {
         "budget": arms.total_steps(config),
         "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],
         "winner": study.best_params, "selection_loss": study.best_value,
         "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
-        "config": asdict(given), "stamp": run_folder.first_stamp(given, "search") | {"status": "completed"},
+        "first_rollout_seed": ROLLOUTS_FROM, "config": asdict(given),
+        "stamp": run_folder.first_stamp(given, "search") | ended,
     }  # fmt: skip
     run_folder.write_json(out / "search.json", found)
     return found

@@ -8,13 +8,13 @@ import pytest
 
 from fedvla_lib import arms, clients, search
 from fedvla_lib.cli import main
-from fedvla_lib.config import from_profile
+from fedvla_lib.config import code_digest, from_profile
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedadam"])
+@pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi"])
 def test_every_trial_has_the_same_budget(strategy):
-    also = {"fedavg": set(), "fedprox": {"proximal_mu"}, "fedadam": {"server_lr"}}[strategy]
+    also = {"fedavg": set(), "fedprox": {"proximal_mu"}}.get(strategy, {"server_lr"})
     config = from_profile("laptop", strategy=strategy)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(30):
@@ -40,6 +40,8 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     assert found["selection_loss"] == min(losses)
     assert found["best"]["loss"] != found["selection_loss"]  # measured on other episodes
     assert found["start"]["n"] == found["best"]["n"] == 2
+    assert found["stamp"]["code"] == code_digest(*arms.TRAINED_BY)  # as in a run folder of an experiment
+    assert found["first_rollout_seed"] == search.ROLLOUTS_FROM
     assert main([*command, "--trials", "2", "--lr", "0.01"]) == 2
     assert "other settings" in capsys.readouterr().err
 
