@@ -772,3 +772,51 @@ def _arrow_label(ax: Axes, name: str, shape: str) -> None:
         ax.text((x + to_x) / 2, y + 0.1, f"{name}\n{shape}", ha="center", va="bottom", fontsize=7, color="#222222")
     else:
         ax.text(x + 0.12, (y + to_y) / 2, f"{name}\n{shape}", va="center", fontsize=7, color="#222222")
+
+
+def heat_maps(
+    tables: dict[str, pd.DataFrame], *, xlabel: str, ylabel: str, label: str, signed: bool = False,
+    axes: Sequence[Axes] | None = None,
+) -> Sequence[Axes]:  # fmt: skip
+    """Draw tables of numbers as coloured squares side by side, on one scale; what is missing is grey, keys are titles.
+
+    Args:
+        tables: rows and columns as they are to stand, the same rows in all.
+        label: of the colours.
+        signed: the numbers lie between -1 and 1, and 0 is the middle of the scale; else it begins at 0.
+    """
+    if axes is None:
+        _, axes = plt.subplots(1, len(tables), figsize=(WIDTH, 2.6), sharey=True, squeeze=False, layout="constrained")
+        axes = axes[0]
+    top = 1.0 if signed else float(np.nanmax([np.nanmax(table.to_numpy()) for table in tables.values()]))
+    for ax, (title, table) in zip(axes, tables.items(), strict=True):
+        scale = {"cmap": "RdBu", "vmin": -top} if signed else {"cmap": "viridis", "vmin": 0}
+        picture = ax.imshow(table.to_numpy(float), aspect="auto", vmax=top, **scale)
+        ax.set_facecolor("#BBBBBB")
+        places = np.unique(np.linspace(0, table.shape[1] - 1, 4).round().astype(int))
+        ax.set_xticks(places, table.columns[places])
+        ax.set_yticks(range(len(table)), table.index)
+        ax.grid(False)
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel(xlabel)
+    axes[0].set_ylabel(ylabel)
+    axes[0].figure.colorbar(picture, ax=list(axes), label=label)
+    return axes
+
+
+def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw points of success for each megabyte that travelled, a bar an arm; columns arm, MB, success_rate, low, high.
+
+    The interval is that of the success rate, divided by the bytes, which are known exactly.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 1.0 + 0.3 * len(table)), layout="constrained")
+    points = {name: 100 * table[name] / table.MB for name in ("success_rate", "low", "high")}
+    errors = np.stack([points["success_rate"] - points["low"], points["high"] - points["success_rate"]])
+    places = np.arange(len(table))
+    ax.barh(places, points["success_rate"], xerr=np.abs(errors), capsize=3, color=PALETTE[0])
+    ax.set_yticks(places, table.arm)
+    ax.set_ylim(len(table) - 0.5, -0.5)
+    ax.set_xlabel("success rate for what travelled [points per MB], 95 % interval")
+    ax.set_ylabel("what travels")
+    return ax

@@ -309,3 +309,26 @@ def test_checkpoints_are_points_of_loss_and_success():
     assert labelled(ax) and [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b"]
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [[3, 0], [1, 0.4], [5, 0], [2, 0.8]])
     assert ax.lines[0].get_linestyle() == "None" and ax.lines[0].get_marker() != ax.lines[1].get_marker()
+
+
+def test_heat_maps_share_a_scale_and_leave_gaps():
+    one = pd.DataFrame([[1.0, np.nan], [0.5, 2.0]], index=["layer 0", "projections"], columns=[1, 2])
+    axes = plots.heat_maps({"lift": one, "push": 2 * one}, xlabel="round", ylabel="part", label="length")
+    assert [ax.get_title() for ax in axes] == ["lift", "push"] and labelled(axes[0])
+    np.testing.assert_array_equal(axes[0].images[0].get_array(), np.ma.masked_invalid(one.to_numpy()))
+    assert [ax.images[0].get_clim() for ax in axes] == [(0, 4)] * 2
+    assert [text.get_text() for text in axes[0].get_yticklabels()] == list(one.index)
+    assert axes[0].figure.axes[-1].get_ylabel() == "length"  # the scale says what the colours are
+    signed = plots.heat_maps({"lift": one / 4}, xlabel="round", ylabel="part", label="cosine", signed=True)
+    assert signed[0].images[0].get_clim() == (-1, 1)
+
+
+def test_success_per_megabyte_is_points_over_bytes_with_the_ends_of_the_interval():
+    table = pd.DataFrame(
+        {"arm": ["a", "b"], "MB": [50.0, 10.0], "success_rate": [0.5, 0.2], "low": [0.4, 0.1], "high": [0.7, 0.3]}
+    )
+    ax = plots.success_per_megabyte(table)
+    assert [bar.get_width() for bar in ax.patches] == pytest.approx([1, 2])
+    assert labelled(ax) and "points per MB" in ax.get_xlabel()
+    bars = ax.containers[0].lines[2][0]
+    np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0.8, 1.4])
