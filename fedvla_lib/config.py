@@ -32,6 +32,7 @@ class Config:
     fraction_train: float = 0.4  # share of clients that train in a round
     fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
     min_replies: int = 1  # good training replies a round needs, else the run stops
+    round_timeout_s: float = 14400.0  # seconds a round waits for its clients; who has not answered by then is left out
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian, krum or scaffold
     server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
     server_momentum: float = 0.5  # fedavgm: share of the last server step that goes on; at 0.9 steps grow tenfold
@@ -64,7 +65,7 @@ class Config:
     action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
     # run
     seed: int = 0  # fixes data order, initial weights, noise, client sampling and rollouts
-    device: str = "cpu"  # torch device: cpu, cuda or mps
+    device: str = "cpu"  # torch device: cpu, cuda or mps; cpu gives way where Flower reserves a card for a client
     num_threads: int = 0  # torch threads; 0 takes the cores granted to this process
     out: str = "outputs"  # where run folders are made
     resume: str = ""  # run folder of an interrupted run to go on with; empty starts a new one
@@ -192,7 +193,7 @@ def check(config: Config) -> Config:
     positive = (
         "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
         "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
-        "validate_every",
+        "validate_every", "round_timeout_s",
     )  # fmt: skip
     for name in positive:
         _require(getattr(config, name) > 0, config, name, "a number above 0")

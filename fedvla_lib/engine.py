@@ -7,6 +7,7 @@ client after the other in the order of their partitions. Scale comes from Flower
 import copy
 import functools
 import logging
+import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -88,7 +89,7 @@ class InlineGrid(Grid):
         self._app, self._progress, self._raise_errors = app, progress, raise_errors
         self._run = Run.create_empty(RUN_ID)
         self._replies: dict[str, Message] = {}
-        self._sent = 0
+        self._took_s: dict[str, float] = {}
         self._contexts = {}
         for k in range(num_clients):
             node, node_config = FIRST_NODE_ID + k, {wire.PARTITION: k, "num-partitions": num_clients}
@@ -127,8 +128,13 @@ class InlineGrid(Grid):
         return [self._replies.pop(key) for key in message_ids if key in self._replies]
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Push and pull; there is nothing to wait for, so `timeout` has no effect."""
-        return self.pull_messages(self.push_messages(messages))
+        """Push and pull, without the replies of clients that took longer than `timeout` seconds.
+
+        Clients take turns here, so each has a clock of its own, as if all had started at once on machines of their own.
+        """
+        sent = self.push_messages(messages)
+        replies = zip(sent, self.pull_messages(sent), strict=True)
+        return [reply for key, reply in replies if timeout is None or self._took_s[key] <= timeout]
 
     def client_states(self) -> dict[str, Arrays]:
         """Return the arrays in the clients' contexts, by node and record."""
@@ -146,9 +152,8 @@ class InlineGrid(Grid):
 
     def _handle(self, message: Message) -> str:
         """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""
-        self._sent += 1
-        key = str(self._sent)
-        node = message.metadata.dst_node_id
+        key = str(len(self._took_s))
+        node, began = message.metadata.dst_node_id, time.perf_counter()
         try:
             self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])
         except Exception as error:
@@ -158,6 +163,7 @@ class InlineGrid(Grid):
             reason = f"{type(error).__name__}: {error}"
             failure = Error(code=ErrorCode.CLIENT_APP_RAISED_EXCEPTION, reason=reason)
             self._replies[key] = Message(failure, reply_to=message)
+        self._took_s[key] = time.perf_counter() - began
         return key
 
 

@@ -19,7 +19,6 @@ from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.tasks import check_tasks
 from fedvla_lib.wire import Rollouts
 
-ROUND_TIMEOUT_S = 4 * 3600.0  # a client that has not answered by then is left out of the round
 CONNECT_TIMEOUT_S = 60.0  # how long to wait for clients to connect
 
 
@@ -99,7 +98,7 @@ def federate(
         grid,
         wire.pack_arrays(arrays),
         num_rounds=config.num_server_rounds - done,
-        timeout=ROUND_TIMEOUT_S,
+        timeout=config.round_timeout_s,
         train_config=ConfigRecord({wire.STATS: wire.pack_stats(stats)}),
         evaluate_config=ConfigRecord({wire.STATS: wire.pack_stats(stats)}),
         evaluate_fn=RoundEnd(judge, strategy, run, states, done),
@@ -197,7 +196,7 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[roster.Roste
     Nothing else about the data leaves a client. Returns the roster, each node's share of all frames, the statistics.
     """
     nodes = roster.wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    members, introductions = roster.call(grid, nodes, run.log, ROUND_TIMEOUT_S)
+    members, introductions = roster.call(grid, nodes, run.log, config.round_timeout_s)
     if len(introductions) < config.min_replies:
         raise roster.TooFewReplies(
             f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "

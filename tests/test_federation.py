@@ -3,6 +3,7 @@
 Faults are injected by real ClientApps around the library's own: they let it work and then damage its reply.
 """
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -199,6 +200,13 @@ def no_examples(content: RecordDict) -> None:
     content[wire.METRICS] = MetricRecord({**content[wire.METRICS], wire.EXAMPLES: 0})
 
 
+PATIENCE_S = 6.0
+
+
+def sleep(content: RecordDict) -> None:
+    time.sleep(PATIENCE_S + 0.5)
+
+
 def crash(content: RecordDict) -> None:
     raise OSError("no space left on device")
 
@@ -209,12 +217,13 @@ DAMAGE = {
     "names": change_arrays(lambda arrays: {f"{name}_": array for name, array in arrays.items()}),
     "hash": change_arrays(change_first(lambda array: array + np.float32(1)), honest=False),
     "examples": no_examples,
+    "silent": sleep,
     "error": crash,
 }
 
 
 def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on(tiny):
-    config = replace(tiny, num_clients=7, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
+    config = replace(tiny, num_clients=8, num_server_rounds=1, local_steps=1, round_timeout_s=PATIENCE_S, **NO_ROLLOUTS)
     tools = engine.remembering(clients.TOOLS)
     app = damaging(dict(enumerate(DAMAGE.values())), tools)
     root = engine.run_inline(config, clients_app=app, progress=False)
@@ -223,10 +232,10 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
     assert dict(zip(rejected.who, rejected.reason, strict=True)) == {f"client_{k}": r for k, r in enumerate(DAMAGE)}
     assert "no space left on device" in rejected.detail.iloc[-1]
     counts = run_folder.read_metrics(root, "replies").query("to == 'train'").iloc[0]
-    assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 6, 1)
+    assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 7, 1)
 
     store = tools.open_frames(config)
-    alone = clients.open_client(config, 6, tools)
+    alone = clients.open_client(config, 7, tools)
     pooled = data.pool_stats([data.episode_stats(store, share.train_ids) for share in clients.shares(store, config)])
     bundle = model.load_policy(config, pooled)
     alone.train(bundle, 1)
