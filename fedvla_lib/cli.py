@@ -397,6 +397,7 @@ def standing_superlink(options: argparse.Namespace) -> int:
 
     if not os.environ.get("FLWR_HOME"):
         raise ValueError("FLWR_HOME is not set: `. flower/env.sh` first, so that Flower settings of your own stay")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was started is stopped here too
     home = Path(os.environ["FLWR_HOME"])
     if options.action == "status":
         is_up, words = standing.status(home)

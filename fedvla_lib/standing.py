@@ -5,25 +5,27 @@ started first, waited for, and stopped by name; its connection file, `connection
 """
 
 import json
-import shutil
+import re
 import tomllib
 from pathlib import Path
 
 import psutil
 
 from fedvla_lib import superlink
-from fedvla_lib.run_folder import write_json
-from fedvla_lib.superlink import FlowerRunError
+from fedvla_lib.run_folder import write_atomically, write_json
 
 CONNECTIONS = Path(__file__).resolve().parent / "connections.toml"
+SECTION = re.compile(r"^(?=\[superlink\.)", re.MULTILINE)  # where the table of a connection begins
 
 
 def up(home: Path) -> str:
     """Start the SuperLink of the connection file with `home` as FLWR_HOME, and say where it is once it answers.
 
+    However it ends without an answer, also by Ctrl-C, nothing is left running.
+
     Raises:
-        FlowerRunError: it did not answer within two minutes; nothing is left running.
-        ValueError: something else uses its port.
+        FlowerRunError: it did not answer within two minutes.
+        ValueError: something else uses its port, or the user's own connections are in the way.
     """
     if process := _running(home):
         return f"{_where()} is up already, process {process.pid}"
@@ -31,16 +33,39 @@ def up(home: Path) -> str:
     if not superlink.is_free(port):
         raise ValueError(f"port {port} is used by another program: stop it, or change the port in {CONNECTIONS}")
     home.mkdir(parents=True, exist_ok=True)
-    shutil.copy(CONNECTIONS, home / "config.toml")
+    add_connections(home / "config.toml")
     command = ["flower-superlink", "--insecure", "--simulation", "--host", "127.0.0.1", "--port", str(port)]
     process = superlink.start(command, superlink.flower_environment(home), log := home / "superlink.log")
     try:
         superlink.wait_until(lambda: superlink.answers(port), process, log, "the SuperLink")
-    except FlowerRunError:
+        write_json(home / "superlink.json", {"pid": process.pid, "created": psutil.Process(process.pid).create_time()})
+    except BaseException:  # it has a session of its own, which Ctrl-C in this one does not reach
         superlink.stop(process)
         raise
-    write_json(home / "superlink.json", {"pid": process.pid, "created": psutil.Process(process.pid).create_time()})
     return f"{_where()} is up, process {process.pid}; its log is {log}"
+
+
+def add_connections(file: Path) -> None:
+    """Add this project's connections to Flower's file of them; what else stands there stays as it is.
+
+    Raises:
+        ValueError: the file is no TOML, or has another connection of the same name.
+    """
+    ours = CONNECTIONS.read_text()
+    if not file.exists():
+        return write_atomically(file, ours.encode())
+    text = file.read_text()
+    try:
+        there = tomllib.loads(text).get("superlink", {})
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file} is no TOML ({error}): mend it, or move it away") from error
+    for section in SECTION.split(ours)[1:]:
+        ((name, connection),) = tomllib.loads(section)["superlink"].items()
+        if there.get(name, connection) != connection:
+            raise ValueError(f"{file} has another [superlink.{name}] than this project: rename or remove it there")
+        if name not in there:
+            text = f"{text.rstrip()}\n\n{section}"
+    write_atomically(file, text.encode())
 
 
 def down(home: Path) -> str:

@@ -59,9 +59,7 @@ class SuperLink:
     port: int = 0
     files: ServerFiles | None = None  # of a SuperLink with TLS
 
-    def submit(
-        self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None
-    ) -> str:
+    def submit(self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None) -> str:
         """Start a run of the app, follow its log until the run ends, and return its id.
 
         Following costs nothing, while each further `flwr` command costs seconds of computing time. Meanwhile `watch` is
@@ -90,7 +88,6 @@ class SuperLink:
         if not answer.get("runs"):
             raise FlowerRunError(f"flwr list knows no run {run_id}")
         return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
-
 
     def ask(self, *command: str) -> dict[str, Any]:
         """Return the JSON that a `flwr` command answers.

@@ -1,14 +1,21 @@
 """The SuperLink that stays up: started, found, used by Flower's own command, and stopped with all it started."""
 
+import json
 import os
+import signal
 import subprocess
+import sys
+import time
+import tomllib
 from pathlib import Path
 
+import psutil
 import pytest
+from conftest import heed_interrupts
 
-from fedvla_lib import run_folder, superlink
+from fedvla_lib import client_app, run_folder, standing, superlink
 from fedvla_lib.cli import main
-from fedvla_lib.config import from_profile
+from fedvla_lib.config import from_profile, to_run_config
 
 ROOT = Path(__file__).parents[1]
 
@@ -16,30 +23,98 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.integration
 @pytest.mark.slow
 def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch, capsys):
-    """As a reader types them: up, `flwr run . local-simulation --stream --run-config ...`, down."""
-    monkeypatch.setenv("FLWR_HOME", str(tmp_path / "flwr"))
+    """As a reader types them: up, and Ctrl-C; up again, `flwr run . local-simulation --stream ...`; down."""
+    home = tmp_path / "flwr"
+    monkeypatch.setenv("FLWR_HOME", str(home))
     before = (ROOT / "pyproject.toml").read_bytes()
     tiny = from_profile(
-        "tiny", base="nano", data=str(recording), num_server_rounds=1, local_steps=1, eval_rollouts=0,
-        client_rollouts=0, num_threads=1, out=str(tmp_path / "outputs"),
+        "tiny", base="nano", data=str(recording), num_server_rounds=1, fraction_train=0.5, local_steps=1,
+        eval_rollouts=0, client_rollouts=0, num_threads=1, out=str(tmp_path / "outputs"),
     )  # fmt: skip
     assert main(["superlink", "status"]) == 3
+    interrupt_while_starting(home)
+    assert main(["superlink", "status"]) == 3 and not processes_of(home)
     try:
         assert main(["superlink", "up"]) == 0
         assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
-        settings = superlink.write_settings(tmp_path, tiny)
-        command = [superlink.program("flwr"), "run", str(ROOT), "local-simulation", "--stream"]
-        command += ["--run-config", str(settings)]
-        command += ["--federation-config", "num-supernodes=3 client-resources-num-cpus=1"]
-        environment = superlink.flower_environment(tmp_path / "flwr")
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
-        assert done.returncode == 0, done.stdout + done.stderr
+        run_app("local-simulation", tiny, "num-supernodes=3")
         (root,) = superlink.run_folders(tiny)
         assert run_folder.read_stamp(root)["status"] == "completed"
+        assert run_folder.read_config(root) == tiny
+        assert len(run_folder.read_metrics(root, "train")) == 2  # half of three clients
     finally:
         assert main(["superlink", "down"]) == 0
     assert main(["superlink", "status"]) == 3
     assert (ROOT / "pyproject.toml").read_bytes() == before
+
+
+def run_app(connection, config, federation):
+    """Call `flwr run` with settings as the README writes them: on the command line, those that differ."""
+    usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
+    told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
+    words = " ".join(f"{name}={json.dumps(value)}" for name, value in told.items())
+    command = [superlink.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words]
+    command += ["--federation-config", federation]
+    environment = superlink.flower_environment(Path(os.environ["FLWR_HOME"]))
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def interrupt_while_starting(home):
+    """Start `fedvla superlink up` and press Ctrl-C before it answers: the signal goes to the whole group."""
+    command = [sys.executable, "-m", "fedvla_lib.cli", "superlink", "up"]
+    options = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "preexec_fn": heed_interrupts}
+    process = subprocess.Popen(command, **options)
+    log = home / "superlink.log"
+    while not (log.exists() and log.stat().st_size):  # Flower has begun to say something
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and said.strip() == "interrupted: nothing was started", said
+
+
+def processes_of(home):
+    """Flower's processes that keep their files there."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get("FLWR_HOME") == str(home) and process.pid != os.getpid():
+                found.append(process)
+        except psutil.Error:
+            continue
+    return psutil.wait_procs(found, timeout=15)[1]
+
+
+@pytest.mark.unit
+def test_connections_of_ones_own_stay_and_one_in_the_way_is_named(tmp_path):
+    file, ours = tmp_path / "config.toml", tomllib.loads(standing.CONNECTIONS.read_text())["superlink"]
+    own = '# mine\n[superlink]\ndefault = "labs"\n\n[superlink.labs]\naddress = "server.example.org:9493"\n'
+    file.write_text(own)
+    standing.add_connections(file)
+    assert file.read_text().startswith(own)
+    merged = tomllib.loads(file.read_text())["superlink"]
+    assert merged == {**ours, "default": "labs", "labs": {"address": "server.example.org:9493"}}
+    once = file.read_text()
+    standing.add_connections(file)
+    assert file.read_text() == once
+    other = own.replace("labs]", "local-simulation]")
+    for text, words in ((other, "has another \\[superlink.local-simulation\\]"), ("default = ", "is no TOML")):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=words):
+            standing.add_connections(file)
+        assert file.read_text() == text
+    file.unlink()
+    standing.add_connections(file)
+    assert file.read_text() == standing.CONNECTIONS.read_text()
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("device", "cards", "chosen"), [("cpu", [], "cpu"), ("cpu", ["0"], "cuda"), ("mps", ["0"], "mps")]
+)
+def test_a_client_computes_on_the_card_that_is_reserved_for_it(device, cards, chosen):
+    assert client_app.on_reserved_card(from_profile("tiny", device=device), cards).device == chosen
 
 
 @pytest.mark.unit
