@@ -3,8 +3,10 @@
 Errors are not caught here: Flower turns them into error replies, which the server rejects by client name and reason.
 """
 
+import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
@@ -12,7 +14,7 @@ from flwr.clientapp import ClientApp
 from flwr.clientapp.typing import Mod
 
 from fedvla_lib import clients, wire
-from fedvla_lib.config import from_run_config
+from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.corrections import ControlVariates, Correction, Parameters, Proximal
 from fedvla_lib.model import Bundle
 from fedvla_lib.params import Arrays, digest, load_arrays, shapes_of, trainable_arrays
@@ -85,8 +87,28 @@ def build(tools: clients.Tools = clients.TOOLS, mods: Sequence[Mod] = ()) -> Cli
     return app
 
 
+def reserved_cards() -> list[str]:
+    """Return the graphics cards that Flower's simulation runtime has reserved for this client: none elsewhere.
+
+    Its workers are Ray's, where Ray is loaded; nobody else is asked to load it.
+    """
+    ray = sys.modules.get("ray")
+    if ray is None or not ray.is_initialized():
+        return []
+    return ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
+
+
+def on_reserved_card(config: Config, cards: Sequence[str]) -> Config:
+    """Return settings with which a client computes where the runtime wants it to: on a card that is reserved for it.
+
+    A connection says what its clients get, and the settings of a run do not know it. A device that these name, other
+    than the default, stays.
+    """
+    return replace(config, device="cuda") if cards and config.device == Config.device else config
+
+
 def _client(context: Context, tools: clients.Tools) -> clients.Client:
-    config = from_run_config(context.run_config)
+    config = on_reserved_card(from_run_config(context.run_config), reserved_cards())
     if wire.PARTITION not in context.node_config:
         raise ValueError(f"this node has no {wire.PARTITION}: start it with --node-config 'partition-id=K'")
     own_data = str(context.node_config.get(wire.DATA, ""))
