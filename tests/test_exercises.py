@@ -14,7 +14,9 @@ pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CHECK = re.compile(r"^check\(\"(\d\d)\.(\w+)\", (\w+)\)$", re.MULTILINE)
-SOLUTION = re.compile(r"```\{dropdown\} Solution\n.*?~~~python\n(.*?)~~~", re.DOTALL)
+# HTML, since a directive of the book's would stand there open in JupyterLab; blank lines, since both read Markdown inside.
+HIDDEN = re.compile(r"^<details>\n<summary>(Solution|Answer)</summary>\n\n(.+?)\n\n</details>$", re.DOTALL | re.MULTILINE)
+SOLUTION = re.compile(r"<summary>Solution</summary>\n\n~~~python\n(.*?)~~~", re.DOTALL)
 GRADES = ("easy", "medium", "hard")
 AT_LEAST = 4
 
@@ -57,6 +59,15 @@ def test_a_chapter_has_exercises_of_every_grade_and_all_its_checks_are_used(note
     assert all(f"({grade})" in text for grade in GRADES)
     assert sorted(f"{chapter}.{name}" for chapter, name, *_ in here) == sorted(exercises.known(here[0][0]))
     assert notebook.name.startswith(here[0][0])
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_solutions_and_answers_are_closed_until_clicked_in_the_book_and_in_jupyterlab(notebook):
+    cells = [cell.source for cell in nbformat.read(notebook, as_version=4).cells if cell.cell_type == "markdown"]
+    hidden = [found for source in cells for found in HIDDEN.findall(source)]
+    text = "\n".join(cells)
+    assert len(hidden) == text.count("<details") == text.count("</details>")
+    assert not re.search(r"\bSolution\b|\{dropdown\}", HIDDEN.sub("", text))
 
 
 @each
