@@ -1,7 +1,8 @@
 """Tables -> Axes. Every function draws one figure's content, labels its axes with units and returns the Axes.
 
 Figures have an opaque white ground so that they stay readable on a dark page; colours are Okabe and Ito's, which remain
-distinct for colour-blind readers. One arm and one joint keep one colour throughout the book.
+distinct for colour-blind readers. One arm and one client keep one colour throughout the book: ask `arm_color` and
+`client_color`; other things that are told apart in one figure only take the palette in its order.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,15 @@ from fedvla_lib.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
 ARM_COLORS = {"base": "#7F7F7F", "local-only": "#E69F00", "federated": "#0072B2", "centralized": "#009E73"}
+ARM_FAMILIES = {  # what a stored arm's name begins with -> its colour; a cadence or an addition follows the name
+    **ARM_COLORS,
+    "fedavg": ARM_COLORS["federated"],
+    "fedavg-10x4x20": "#56B4E9",
+    "scaffold": "#D55E00",
+    "fedprox": "#CC79A7",
+}
+# Okabe and Ito's, then two of Tol's muted scheme: ten clients is what a federation of this book has.
+CLIENT_COLORS = (*PALETTE[:6], "#117733", "#000000", "#882255", "#7F7F7F")
 WIDTH = 7  # inches; on a page a wider figure shrinks, and its text with it
 STYLE = {
     "figure.facecolor": "white",
@@ -38,6 +48,18 @@ STYLE = {
 def use_style() -> None:
     """Apply the book's figure style to this session."""
     plt.rcParams.update(STYLE)
+
+
+def arm_color(arm: str, other: int = 0) -> str:
+    """Return the colour of an arm throughout the book; one without its own takes number `other` of the palette."""
+    name = arm.lower().replace(", ", "-") + "-"
+    own = [color for family, color in ARM_FAMILIES.items() if name.startswith(f"{family}-")]
+    return own[-1] if own else PALETTE[other % len(PALETTE)]
+
+
+def client_color(client: int) -> str:
+    """Return the colour of a client throughout the book, by its number; ten differ."""
+    return CLIENT_COLORS[client % len(CLIENT_COLORS)]
 
 
 def joints(states: np.ndarray, actions: np.ndarray, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
@@ -133,8 +155,7 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         part = table[table.arm == arm].set_index("task").loc[tasks]
         errors = np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
         place = np.arange(len(tasks)) + (i - (len(arms) - 1) / 2) * width
-        color = ARM_COLORS.get(arm, PALETTE[i % len(PALETTE)])
-        ax.bar(place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=arm, color=color)
+        ax.bar(place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=arm, color=arm_color(arm, i))
     ax.set_xticks(range(len(tasks)), tasks)
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("task")
@@ -437,9 +458,11 @@ def client_statistics(
     places = np.arange(len(means))
     for i, ax in enumerate(axes):
         low, high = pooled_mean[i] - pooled_std[i], pooled_mean[i] + pooled_std[i]
-        ax.axhspan(low, high, color=PALETTE[1], alpha=0.12, label="pooled mean ± std")
-        ax.axhline(pooled_mean[i], color=PALETTE[1])
-        ax.errorbar(places, means[:, i], stds[:, i], fmt="o", capsize=2, markersize=4, label="client mean ± std")
+        ax.axhspan(low, high, color="black", alpha=0.12, label="pooled mean ± std")
+        ax.axhline(pooled_mean[i], color="black")
+        for k, (mean, std) in enumerate(zip(means[:, i], stds[:, i], strict=True)):
+            label = "" if k else "client mean ± std"
+            ax.errorbar(k, mean, std, fmt="o", capsize=2, markersize=4, color=client_color(k), label=label)
         ax.set_title(JOINT_NAMES[i], fontsize=10)
         ax.set_ylabel(f"action [{JOINT_UNITS[i]}]")
         ax.set_xticks(places)
@@ -475,7 +498,7 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
     width = 0.8 / table.shape[1]
     for i, name in enumerate(table.columns):
         place = np.arange(len(table)) + (i - (table.shape[1] - 1) / 2) * width
-        ax.bar(place, table[name], width * 0.9, label=name, color=ARM_COLORS.get(name, PALETTE[i % len(PALETTE)]))
+        ax.bar(place, table[name], width * 0.9, label=name, color=arm_color(name, i))
     ax.set_xticks(range(len(table)), table.index.astype(str))
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
@@ -487,15 +510,16 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
 def clients_by_round(table: pd.DataFrame, value: str, *, ylabel: str, ax: Axes | None = None) -> Axes:
     """Draw a metric of every client by round, and their mean weighted by frames; columns round, who, num_examples."""
     ax = ax or _new_axes()
-    for number, (_, part) in enumerate(table.groupby("who", sort=False)):
-        ax.plot(part["round"], part[value], ".-", color="#AAAAAA", linewidth=1, label="" if number else "one client")
+    for who, part in table.groupby("who", sort=False):
+        color = client_color(int(who.removeprefix("client_")))
+        ax.plot(part["round"], part[value], ".-", color=color, linewidth=1, label=who.replace("_", " "))
     weighted = (table[value] * table.num_examples).groupby(table["round"]).sum()
     mean = weighted / table.groupby("round").num_examples.sum()
-    ax.plot(mean.index, mean, "o-", color=PALETTE[0], linewidth=2, label="mean weighted by frames")
+    ax.plot(mean.index, mean, "--", color="black", linewidth=2, label="mean weighted by frames")
     _round_ticks(ax, table["round"])
     ax.set_xlabel("round")
     ax.set_ylabel(ylabel)
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return ax
 
 
@@ -520,7 +544,7 @@ def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
     """Draw one point an arm: held-out loss across, success rate up; columns arm, loss, success_rate, low, high."""
     ax = ax or _new_axes()
     for i, point in enumerate(table.itertuples()):
-        color = ARM_COLORS.get(point.arm, PALETTE[i % len(PALETTE)])
+        color = arm_color(point.arm, i)
         error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
         ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.arm)
     ax.set_xscale("log")  # the start may lie many times above the trained arms
@@ -585,12 +609,18 @@ def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = N
     """Draw each column of a table against its index; a column named ``optimum`` is a dotted line."""
     ax = ax or _new_axes()
     for i, name in enumerate(table.columns):
-        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": PALETTE[i % len(PALETTE)]}
+        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": _column_color(str(name), i)}
         ax.plot(table.index, table[name], label=name, **look)
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
     ax.legend(frameon=False, ncols=min(4, table.shape[1]), loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return ax
+
+
+def _column_color(name: str, place: int) -> str:
+    """A client keeps its colour; other columns are arms, or take the palette in order."""
+    kind, _, number = name.partition(" ")
+    return client_color(int(number)) if kind == "client" and number.isdigit() else arm_color(name, place)
 
 
 def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes | None = None) -> Axes:
@@ -605,6 +635,11 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
         part = table[table.partition == partition]
         rows = np.array([arms.index(arm) for arm in part.arm]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
         errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
+        if len(partitions) == 1:  # then the colours are the arms'
+            for row, rate, error, arm in zip(rows, 100 * part.success_rate, errors.T, part.arm, strict=True):
+                look = {"fmt": "o", "capsize": 3, "color": arm_color(arm, int(row))}
+                ax.errorbar(rate, row, xerr=error[:, None], **look)
+            continue
         color = PALETTE[i % len(PALETTE)]
         ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
     ax.set_yticks(range(len(arms)), arms)
@@ -624,7 +659,7 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         _, ax = plt.subplots(figsize=(WIDTH, 4.6), layout="constrained")
     for i, row in enumerate(table.itertuples()):
         errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
-        color, marker = PALETTE[i % len(PALETTE)], "osD^vP*X"[i // len(PALETTE) % 8]
+        color, marker = arm_color(row.arm, i), "osD^vP*X"[(i + i // 8) % 8]
         ax.errorbar(row.MB, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
@@ -645,8 +680,8 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
     for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
         for ax, value in zip(axes, ("loss", "success_rate"), strict=True):
             over = part.dropna(subset=[value]).groupby("steps")[value].agg(["mean", "min", "max"])
-            ax.plot(over.index, over["mean"], "o-", color=PALETTE[i % len(PALETTE)], label=arm)
-            ax.fill_between(over.index, over["min"], over["max"], color=PALETTE[i % len(PALETTE)], alpha=0.15)
+            ax.plot(over.index, over["mean"], "o-", color=arm_color(arm, i), label=arm)
+            ax.fill_between(over.index, over["min"], over["max"], color=arm_color(arm, i), alpha=0.15)
             ax.set_xlabel("gradient steps of all clients")
     axes[0].set_ylabel("held-out loss [normalised units²]")
     axes[0].set_yscale("log")
@@ -663,7 +698,7 @@ def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw one point a checkpoint: held-out loss across, success rate up, an arm a colour; columns as above."""
     ax = ax or _new_axes()
     for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
-        ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=PALETTE[i % len(PALETTE)], label=arm)
+        ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=arm_color(arm, i), label=arm)
     ax.set_ylim(-0.02, 1.02)
     ax.set_xlabel("held-out loss [normalised units²]")
     ax.set_ylabel("success rate")
@@ -819,4 +854,71 @@ def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("success rate for what travelled [points per MB], 95 % interval")
     ax.set_ylabel("what travels")
+    return ax
+
+
+def federation(
+    clients: Sequence[str], *, down: str, up: str, server: str = "server", refused: str = "", ax: Axes | None = None
+) -> Axes:
+    """Draw a federation: a server above its clients, each in its colour, and what goes down and comes up.
+
+    Args:
+        clients: a line of text for each client's box.
+        down, up: what the arrows carry.
+        refused: if given, the text of one more box that the server turns away.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 3.4), layout="constrained")
+    places = np.arange(len(clients) + bool(refused)) * 2.0
+    middle = places.mean()
+    _box(ax, middle, 2.2, server, "#BBBBBB")
+    for k, (x, text) in enumerate(zip(places, clients, strict=False)):
+        _box(ax, x, 0.0, text, client_color(k))
+        for shift, start, end in ((-0.25, 1.8, 0.4), (0.25, 0.4, 1.8)):
+            foot, head = x + shift, middle + shift + 0.25 * (x - middle)
+            ends = ((head, start), (foot, end)) if start > end else ((foot, start), (head, end))
+            _arrow(ax, *ends, color=client_color(k))
+    if refused:
+        _box(ax, places[-1], 0.0, refused, "#FFFFFF")
+        _arrow(ax, (places[-1], 0.4), (middle + 0.25 * (places[-1] - middle), 1.7), color="black", linestyle=":")
+        ax.text((places[-1] + middle) / 2 + 0.4, 1.2, "✗", fontsize=20, ha="center", va="center")
+    ax.text(places[0] - 0.9, 1.3, f"down:\n{down}", ha="left", va="center", fontsize=9)
+    ax.text(places[-1] + 0.9, 1.3, f"up:\n{up}", ha="right", va="center", fontsize=9)
+    ax.set_xlim(places[0] - 1.0, places[-1] + 1.0)
+    ax.set_ylim(-0.6, 2.8)
+    ax.set_axis_off()
+    return ax
+
+
+def _box(ax: Axes, x: float, y: float, text: str, color: str) -> None:
+    ax.add_patch(plt.Rectangle((x - 0.85, y - 0.4), 1.7, 0.8, facecolor=color, alpha=0.35, edgecolor="black"))
+    ax.text(x, y, text, ha="center", va="center", fontsize=9)
+
+
+def _arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], **look: str) -> None:
+    ax.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, **look})
+
+
+def client_drift(
+    server: np.ndarray, local: Sequence[np.ndarray], wanted: np.ndarray, optimum: np.ndarray, *, ax: Axes | None = None
+) -> Axes:
+    """Draw federated averaging of two weights: where the clients walk in their local phases, and where averages land.
+
+    Args:
+        server: the average after each round, from the start on, (rounds + 1, 2).
+        local: for each client the points of its local phases, (rounds, steps + 1, 2).
+        wanted: each client's own minimum, (clients, 2).
+        optimum: the minimum of the mean loss, (2,).
+    """
+    ax = ax or _new_axes()
+    for k, phases in enumerate(local):
+        ax.plot(*wanted[k], "X", color=client_color(k), markersize=10)
+        for number, phase in enumerate(phases):
+            label = "" if number else f"client {k}; cross: what it wants"
+            ax.plot(*phase.T, "-", color=client_color(k), linewidth=1, label=label)
+    ax.plot(*server.T, "o--", color="black", markersize=4, label="server: average of both")
+    ax.plot(*optimum, "k*", markersize=14, label="best for both together")
+    ax.set_xlabel("first weight")
+    ax.set_ylabel("second weight")
+    ax.legend(frameon=False, fontsize=8, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return ax

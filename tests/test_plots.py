@@ -1,6 +1,11 @@
 """Figures: what the reader needs is on the axes, and the numbers drawn are the numbers given."""
 
+import ast
+import re
+from pathlib import Path
+
 import matplotlib
+import nbformat
 import numpy as np
 import pandas as pd
 import pytest
@@ -116,7 +121,8 @@ def test_client_statistics_and_weights_show_every_client():
     means = np.arange(12.0).reshape(2, 6)
     axes = plots.client_statistics(means, np.ones((2, 6)), means.mean(axis=0), np.ones(6))
     assert len(axes) == 6
-    np.testing.assert_allclose(axes[3].containers[0].lines[0].get_ydata(), means[:, 3])
+    drawn = [(bar.lines[0].get_ydata().item(), bar.lines[0].get_color()) for bar in axes[3].containers]
+    assert drawn == [(3.0, plots.client_color(0)), (9.0, plots.client_color(1))]
     weights = pd.DataFrame({"by frames": [0.25, 0.75], "equal": [0.5, 0.5]})
     ax = plots.client_weights(weights)
     assert [bar.get_height() for bar in ax.patches] == [25, 75, 50, 50] and labelled(ax)
@@ -130,11 +136,11 @@ def test_grouped_bars_give_every_number_a_bar_and_an_arm_its_colour():
 
 
 def test_clients_by_round_weights_the_mean_by_frames():
-    table = pd.DataFrame(
-        {"round": [1, 1, 2, 2], "who": ["a", "b"] * 2, "loss": [1.0, 5.0, 2.0, 2.0], "num_examples": [3, 1] * 2}
-    )
+    table = pd.DataFrame({"round": [1, 1, 2, 2], "who": ["client_0", "client_3"] * 2, "num_examples": [3, 1] * 2})
+    table["loss"] = [1.0, 5.0, 2.0, 2.0]
     ax = plots.clients_by_round(table, "loss", ylabel="loss")
     np.testing.assert_allclose(ax.lines[-1].get_ydata(), [2.0, 2.0])
+    assert [line.get_color() for line in ax.lines[:2]] == [plots.client_color(0), plots.client_color(3)]
     assert len(ax.lines) == 3 and labelled(ax)
 
 
@@ -332,3 +338,77 @@ def test_success_per_megabyte_is_points_over_bytes_with_the_ends_of_the_interval
     assert labelled(ax) and "points per MB" in ax.get_xlabel()
     bars = ax.containers[0].lines[2][0]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0.8, 1.4])
+
+
+def test_a_federation_shows_every_client_in_its_colour_and_who_is_refused():
+    ax = plots.federation(["client 0", "client 1"], down="weights", up="numbers", refused="intruder")
+    faces = [matplotlib.colors.to_hex(box.get_facecolor()) for box in ax.patches]
+    assert faces[1:3] == [plots.client_color(k).lower() for k in (0, 1)]
+    said = " ".join(text.get_text() for text in ax.texts)
+    assert all(word in said for word in ("server", "client 1", "intruder", "✗", "weights", "numbers"))
+    assert "✗" not in " ".join(text.get_text() for text in plots.federation(["a"], down="", up="").texts)
+
+
+def test_client_drift_draws_every_local_phase_and_the_averages():
+    server = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 1.0]])
+    local = [np.zeros((2, 4, 2)), np.ones((2, 4, 2))]
+    ax = plots.client_drift(server, local, np.eye(2), np.array([0.5, 0.5]))
+    assert sum(line.get_color() == plots.client_color(1) for line in ax.lines) == 3 and labelled(ax)
+    (averages,) = [line for line in ax.lines if (line.get_label() or "").startswith("server")]
+    np.testing.assert_allclose(averages.get_xydata(), server)
+
+
+def test_arms_and_clients_have_one_colour_each():
+    assert len({plots.arm_color(arm) for arm in plots.ARM_COLORS}) == len(plots.ARM_COLORS)
+    for figure in (plots.curves, plots.grouped_bars):  # wherever an arm stands among others
+        table = pd.DataFrame({"other": [1.0, 2.0], "centralized": [1.0, 2.0]})
+        ax = figure(table, xlabel="x", ylabel="y")
+        found = ax.lines[1].get_color() if ax.lines else matplotlib.colors.to_hex(ax.patches[2].get_facecolor())
+        assert found.lower() == plots.ARM_COLORS["centralized"].lower()
+    assert plots.arm_color("FedAvg") == plots.arm_color("fedavg-200x2x2") == plots.arm_color("federated")
+    assert plots.arm_color("fedavg-10x4x20") != plots.arm_color("federated")
+    assert len(set(plots.CLIENT_COLORS)) == 10 and plots.client_color(13) == plots.client_color(3)
+
+
+def colours_in(tree):
+    """Every colour that code gives by name or number: as a keyword, in a mapping, or at the head of a line's format."""
+    of_a_task = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "options"}
+    for node in ast.walk(tree):
+        given = [node] if isinstance(node, ast.keyword) and node.arg else []
+        if isinstance(node, ast.Dict) and id(node) not in of_a_task:  # a cube's colour is none of a figure
+            pairs = zip(node.keys, node.values, strict=True)
+            given = [ast.keyword(key.value, value) for key, value in pairs if isinstance(key, ast.Constant)]
+        for one in given:
+            if isinstance(one.value, ast.Constant) and isinstance(one.value.value, str):
+                if "color" in str(one.arg) or one.arg == "c":
+                    yield one.value.value
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("plot", "errorbar", "scatter"):
+            texts = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            yield from (text[0] for text in texts if text[0] in "bgrcmyk" or text.startswith("C"))
+        if isinstance(node, ast.Constant) and re.fullmatch(r"#[0-9A-Fa-f]{6}", str(node.value)):
+            yield node.value
+
+
+def is_neutral(colour):
+    if colour in ("black", "white", "k", "w", "none"):
+        return True
+    return colour.startswith("#") and len({colour[i : i + 2].lower() for i in (1, 3, 5)}) == 1  # a grey
+
+
+def sources():
+    """The module of figures, and the code of every chapter."""
+    yield pytest.param(Path(plots.__file__).read_text(), id="plots")
+    for path in sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb")):
+        cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+        yield pytest.param("\n".join(cells), id=path.stem)
+
+
+@pytest.mark.parametrize("code", list(sources()))
+def test_no_figure_has_a_colour_of_its_own(code):
+    known = {*plots.PALETTE, *plots.CLIENT_COLORS, *plots.ARM_FAMILIES.values()}
+    assert not [colour for colour in colours_in(ast.parse(code)) if colour not in known and not is_neutral(colour)]
+
+
+def test_a_raw_colour_would_be_noticed():
+    said = ast.parse("ax.plot(x, y, 'r--', color='tab:red', label='k'); ax.bar(x, y, edgecolor='#12AB34')")
+    assert {"r", "tab:red", "#12AB34"} == {colour for colour in colours_in(said) if not is_neutral(colour)}
