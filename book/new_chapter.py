@@ -31,7 +31,7 @@ def make(root: Path, name: str) -> list[Path]:
     if taken:
         raise ValueError(f"number {number} is taken by {taken[0]}: choose another")
     title = words.replace("_", " ").capitalize()
-    words_of = {"CHAPTER": name.replace("_", "-"), "TITLE": title, "NN.": f"{number}."}
+    words_of = {"CHAPTER_NAME": name, "CHAPTER": name.replace("_", "-"), "TITLE": title, "NN.": f"{number}."}
     written = []
     for place, source in TEMPLATE.items():
         text = (ROOT / "book" / "template" / source).read_text(encoding="utf-8")

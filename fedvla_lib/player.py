@@ -2,6 +2,7 @@
 
 import io
 from base64 import b64encode
+from collections.abc import Sequence
 from fractions import Fraction
 from html import escape
 from pathlib import Path
@@ -32,6 +33,13 @@ def video_figure(film: Path | str | bytes, sentence: str) -> str:
         "</video>"
     )
     return f"<figure style='margin:0'>{video}<figcaption style='{LOOKS}'>{text}</figcaption></figure>"
+
+
+def side_by_side(films: Sequence[np.ndarray]) -> np.ndarray:
+    """Return films of one height, uint8 (T, H, W, 3), beside each other; one that ends earlier stands still."""
+    longest = max(map(len, films))
+    held = [np.concatenate([film, film[-1:].repeat(longest - len(film), axis=0)]) for film in films]
+    return np.concatenate(held, axis=2)
 
 
 def _poster_and_length(content: bytes, name: str) -> tuple[bytes, float]:

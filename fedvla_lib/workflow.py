@@ -1,6 +1,9 @@
-"""The checklist of a federated run: nine steps, and which of them a chapter has tested."""
+"""What chapters share: the checklist of a federated run, ticked by tests, and the library's own source, shown."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 STEPS = {
     "environment": "what is needed is installed, at known versions",
@@ -42,3 +45,27 @@ def checklist(**tests: bool) -> Checklist:
         if not bool(holds):
             raise AssertionError(f"the test of step {step!r} does not hold")
     return Checklist(frozenset(tests))
+
+
+@dataclass(frozen=True)
+class Source:
+    """Code of the library; a notebook shows it as a block of Python."""
+
+    code: str
+
+    def _repr_markdown_(self) -> str:
+        return f"```python\n{self.code}```"
+
+    def __repr__(self) -> str:
+        return self.code
+
+
+def show(thing: Callable[..., Any]) -> Source:
+    """Return the source of a function or class of the library as it is, so that a chapter cannot show another.
+
+    Raises:
+        ValueError: it is not the library's.
+    """
+    if not str(thing.__module__).startswith("fedvla_lib."):
+        raise ValueError(f"{thing.__qualname__} is of {thing.__module__}, not of fedvla_lib: show what the library has")
+    return Source(inspect.getsource(thing))

@@ -14,9 +14,9 @@ pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CHECK = re.compile(r"^check\(\"(\d\d)\.(\w+)\", (\w+)\)$", re.MULTILINE)
-# HTML, since a directive of the book's would stand there open in JupyterLab; blank lines, since both read Markdown inside.
-HIDDEN = re.compile(r"^<details>\n<summary>(Solution|Answer)</summary>\n\n(.+?)\n\n</details>$", re.DOTALL | re.MULTILINE)
-SOLUTION = re.compile(r"<summary>Solution</summary>\n\n~~~python\n(.*?)~~~", re.DOTALL)
+# HTML, as a directive of the book's would stand there open in JupyterLab; blank lines, for the Markdown inside.
+HIDDEN = re.compile(r"^<details>\n<summary>(Solution|Answer)</summary>\n\n(.+?)\n\n</details>$", re.S | re.M)
+SOLUTION = re.compile(r"<summary>Solution</summary>\n\n.*?~~~python\n(.*?)~~~", re.DOTALL)
 GRADES = ("easy", "medium", "hard")
 AT_LEAST = 4
 

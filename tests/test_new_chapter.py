@@ -24,6 +24,7 @@ def copy(tmp_path_factory):
     shutil.copytree(ROOT / "fedvla_lib", root / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
     (root / "tests" / "wrong_answers").mkdir(parents=True)
     shutil.copy(ROOT / "_toc.yml", root)
+    shutil.copytree(ROOT / "book" / "reference" / "comparison", root / "book" / "reference" / "comparison")
     new_chapter.make(root, NAME)
     return root
 

@@ -1,0 +1,77 @@
+"""What a chapter takes: counted at its end, kept from a build, shown at its top; a dash is what nobody measured."""
+
+import json
+from pathlib import Path
+
+import keep_costs
+import nbformat
+import numpy as np
+import pytest
+from nbformat import v4
+
+from fedvla_lib import cost
+
+pytestmark = pytest.mark.unit
+ROOT = Path(__file__).parents[1]
+
+
+def logged(folder, **replies):
+    folder.mkdir(parents=True)
+    event = {"round": 1, "who": "global", "kind": "replies", "time": "", "values": replies}
+    (folder / "metrics.jsonl").write_text(json.dumps(event) + "\n")
+
+
+def test_spent_adds_up_what_the_federations_exchanged_each_once(tmp_path):
+    logged(tmp_path / "runs" / "one", to="train", sent_bytes=2_000_000, received_bytes=500_000)
+    logged(tmp_path / "runs" / "two", to="train", sent_bytes=1_000_000, received_bytes=0)
+    folders = [tmp_path / "runs", tmp_path / "runs" / "one"]
+    found = cost.spent(12.34, "tiny", 3, folders)
+    assert found.exchanged_mb == 3.5 and found.seconds == 12.3
+    assert "3.5 MB" in repr(found) and "profile tiny, seed 3" in repr(found).lower()
+    assert "exchanged" not in repr(cost.spent(1, "tiny", 0))
+
+
+def test_memory_is_the_most_that_was_held():
+    before = cost.spent(0, "tiny", 0).memory_mb
+    held = np.ones(40_000_000)  # 320 MB
+    del held
+    assert cost.spent(0, "tiny", 0).memory_mb > max(before, 320)
+
+
+def executed(folder, name, *, built=True, said=True):
+    """An executed chapter as a build leaves it."""
+    data = cost.spent(5, "tiny", 0)._repr_mimebundle_()
+    cell = v4.new_code_cell("cost.spent()", outputs=[v4.new_output("execute_result", data=data)] if said else [])
+    notebook = v4.new_notebook(cells=[cell], metadata={"fedvla": {"seconds": 7.5}} if built else {})
+    folder.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, folder / f"{name}.ipynb")
+
+
+def test_what_a_build_measured_is_kept_and_shown(tmp_path):
+    chapters = "".join(f"- file: notebooks/{name}\n" for name in ("01_a", "02_b"))
+    (tmp_path / "_toc.yml").write_text(f"format: jb-book\nroot: a\nchapters:\n{chapters}")
+    folder = tmp_path / "_build" / "tiny" / "executed"
+    executed(folder, "01_a")
+    with pytest.raises(ValueError, match=r"not executed at profile tiny: 02_b"):
+        keep_costs.keep(tmp_path, "tiny")
+    executed(folder, "02_b", said=False)
+    kept = keep_costs.keep(tmp_path, "tiny")
+    shown = cost.measured("01_a", kept.parent)
+    assert shown.loc["tiny", "time [s]"] == "8" and float(shown.loc["tiny", "memory [MB]"].replace(",", "")) > 10
+    assert set(shown.loc["laptop"]) == {"–"}
+    assert cost.measured("02_b", kept.parent).loc["tiny"].tolist()[:3] == ["8", "–", "–"]
+    assert set(cost.measured("03_c", kept.parent).to_numpy().ravel()) == {"–"}
+
+
+def test_a_copy_that_no_build_made_is_refused(tmp_path):
+    executed(tmp_path, "01_a", built=False)
+    with pytest.raises(ValueError, match="01_a.ipynb was not executed by make book"):
+        keep_costs.measured_in(tmp_path / "01_a.ipynb")
+
+
+def test_the_kept_costs_are_of_the_chapters_that_there_are():
+    chapters = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
+    files = sorted((ROOT / "book" / "reference" / "costs").glob("*.json"))
+    assert {file.stem for file in files} >= {"tiny", "laptop"}
+    for file in files:
+        assert set(json.loads(file.read_text())["chapters"]) == chapters, file.name
