@@ -32,10 +32,10 @@ def measured_in(executed: Path) -> dict[str, float | None]:
     if "fedvla" not in notebook.metadata:
         raise ValueError(f"{executed.name} was not executed by make book")
     said = [
-        output["data"][MEASURED]
+        output["metadata"][MEASURED]
         for cell in notebook.cells
         for output in cell.get("outputs", [])
-        if MEASURED in output.get("data", {})
+        if MEASURED in output.get("metadata", {})
     ]
     last = said[-1] if said else {}
     costs = {name: last.get(name) for name in ("memory_mb", "exchanged_mb")}

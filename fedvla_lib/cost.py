@@ -19,7 +19,7 @@ from fedvla_lib import run_folder
 from fedvla_lib.config import PROFILES
 
 KEPT = Path("../book/reference/costs")  # as seen from a chapter; a file for each profile
-MEASURED = "application/vnd.fedvla.cost+json"  # what an output carries beside its sentence
+MEASURED = "fedvla_cost"  # in the metadata of an output, beside its sentence
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Spent:
             f"Profile {self.profile}, seed {self.seed}."
         )
 
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
-        return {"text/plain": repr(self), "text/markdown": repr(self), MEASURED: asdict(self)}
+    def _repr_mimebundle_(self, **_: Any) -> tuple[dict[str, str], dict[str, Any]]:
+        return {"text/plain": repr(self), "text/markdown": repr(self)}, {MEASURED: asdict(self)}
 
 
 def spent(seconds: float, profile: str | None, seed: int, folders: Iterable[str | Path] = ()) -> Spent:

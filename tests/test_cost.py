@@ -40,8 +40,9 @@ def test_memory_is_the_most_that_was_held():
 
 def executed(folder, name, *, built=True, said=True):
     """An executed chapter as a build leaves it."""
-    data = cost.spent(5, "tiny", 0)._repr_mimebundle_()
-    cell = v4.new_code_cell("cost.spent()", outputs=[v4.new_output("execute_result", data=data)] if said else [])
+    data, metadata = cost.spent(5, "tiny", 0)._repr_mimebundle_()
+    shown = v4.new_output("execute_result", data=data, metadata=metadata)
+    cell = v4.new_code_cell("cost.spent()", outputs=[shown] if said else [])
     notebook = v4.new_notebook(cells=[cell], metadata={"fedvla": {"seconds": 7.5}} if built else {})
     folder.mkdir(parents=True, exist_ok=True)
     nbformat.write(notebook, folder / f"{name}.ipynb")
@@ -72,6 +73,6 @@ def test_a_copy_that_no_build_made_is_refused(tmp_path):
 def test_the_kept_costs_are_of_the_chapters_that_there_are():
     chapters = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
     files = sorted((ROOT / "book" / "reference" / "costs").glob("*.json"))
-    assert {file.stem for file in files} >= {"tiny", "laptop"}
+    assert "laptop" in {file.stem for file in files}
     for file in files:
         assert set(json.loads(file.read_text())["chapters"]) == chapters, file.name
