@@ -8,8 +8,10 @@ Chromium is the system's. Exit status 1 if anything is found.
 import argparse
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -25,6 +27,7 @@ NARROW = {"width": 360, "height": 740}  # pixels of a small phone
 WIDE = {"width": 1280, "height": 900}
 SEARCHED = "FedAvg"
 SEVERE = {"serious", "critical"}
+COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}  # what a change of theme can break
 REQUIRED = ("404.html", "sitemap.xml")  # what extensions of _config.yml make beside the pages of the contents
 VIDEO_BYTES = 1_000_000  # a video above this makes a reader on a phone wait
 # Headless, in a container without a graphics card, and asking the network for nothing but the pages.
@@ -32,6 +35,8 @@ FLAGS = [
     "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 ]  # fmt: skip
+BROWSERS = 2  # that share the pages; each keeps a core busy
+Look = Callable[[Page, str], list[str]]
 SHORT_ALT = 12  # characters; a shorter text does not say what a figure shows
 
 # Each returns a list of sentences about what is wrong on the page.
@@ -81,17 +86,36 @@ def pages(folder: Path) -> list[str]:
     return found
 
 
-def dead_links(folder: Path, page: str) -> list[str]:
-    """Return the links of a page to files or anchors of this site that do not exist."""
-    soup, found = _soup(folder / page), []
-    for href in {a["href"] for a in soup.find_all("a", href=True)}:
+@dataclass(frozen=True)
+class Facts:
+    """What a page's own text says: its anchors, its links, and the sources of its videos."""
+
+    anchors: frozenset[str]
+    links: frozenset[str]
+    videos: tuple[str, ...]
+
+
+def read(folder: Path, page: str) -> Facts:
+    """Return the facts of a page; films inside a page make it long, so each is read once."""
+    soup = BeautifulSoup((folder / page).read_text(encoding="utf-8"), "html.parser")
+    return Facts(
+        frozenset(tag["id"] for tag in soup.find_all(id=True)),
+        frozenset(tag["href"] for tag in soup.find_all("a", href=True)),
+        tuple(tag["src"] for tag in soup.select("video[src], video source[src]")),
+    )
+
+
+def dead_links(folder: Path, page: str, site: dict[str, Facts]) -> list[str]:
+    """Return the links of a page to files or anchors of its site that do not exist."""
+    found = []
+    for href in sorted(site[page].links):
         target = urlparse(urljoin(page, href)) if not href.startswith("#") else urlparse(page + href)
         if target.scheme or target.netloc or href in ("", "#"):
             continue
-        file = folder / unquote(target.path).lstrip("/")  # the page for what is not found links from the root
-        if not file.is_file():
+        path, anchor = unquote(target.path).lstrip("/"), unquote(target.fragment)  # 404.html links from the root
+        if not (folder / path).is_file():
             found.append(f"links to {href}, which is not there")
-        elif target.fragment and file.suffix == ".html" and not _has(file, unquote(target.fragment)):
+        elif anchor and path in site and anchor not in site[path].anchors:
             found.append(f"links to {href}, which has no such anchor")
     return found
 
@@ -101,10 +125,9 @@ def missing_files(folder: Path) -> list[str]:
     return [f"{name} is missing" for name in REQUIRED if not (folder / name).is_file()]
 
 
-def heavy_videos(folder: Path, page: str) -> list[str]:
+def heavy_videos(folder: Path, page: str, site: dict[str, Facts]) -> list[str]:
     """Return the videos of a page that hold more than `VIDEO_BYTES`; inside the page, its text counts."""
-    tags = _soup(folder / page).select("video[src], video source[src]")
-    sizes = [_bytes_of(folder, page, tag["src"]) for tag in tags]
+    sizes = [_bytes_of(folder, page, source) for source in site[page].videos]
     return [f"video {i} has {size / 1e6:.1f} MB" for i, size in enumerate(sizes, start=1) if size > VIDEO_BYTES]
 
 
@@ -113,14 +136,6 @@ def _bytes_of(folder: Path, page: str, source: str) -> int:
         return len(source)
     file = folder / unquote(urlparse(urljoin(page, source)).path).lstrip("/")
     return file.stat().st_size if file.is_file() else 0  # the browser says that it is missing
-
-
-def _soup(file: Path) -> BeautifulSoup:
-    return BeautifulSoup(file.read_text(encoding="utf-8"), "html.parser")
-
-
-def _has(file: Path, anchor: str) -> bool:
-    return _soup(file).find(id=anchor) is not None
 
 
 def look(page: Page, address: str) -> list[str]:
@@ -135,15 +150,16 @@ def look(page: Page, address: str) -> list[str]:
     found += page.evaluate(FIGURES) + page.evaluate(VIDEOS) + [f"light: {line}" for line in barriers(page)]
     page.evaluate(DARK)
     page.wait_for_timeout(500)  # colours fade over
-    found += page.evaluate(DARK_FIGURES) + [f"dark: {line}" for line in barriers(page)]
+    found += page.evaluate(DARK_FIGURES) + [f"dark: {line}" for line in barriers(page, COLOURS)]
     page.set_viewport_size(NARROW)
     return found + page.evaluate(WIDTH)
 
 
-def barriers(page: Page) -> list[str]:
-    """Return axe-core's serious findings."""
+def barriers(page: Page, only: dict | None = None) -> list[str]:
+    """Return axe-core's serious findings, of all its rules or of those that `only` names."""
     # Without preload: axe would read style sheets itself, from a wrong place, and be told 404.
-    violations = Axe().run(page, options={"preload": False}).response["violations"]
+    options = {"preload": False, "resultTypes": ["violations"], **({"runOnly": only} if only else {})}
+    violations = Axe().run(page, options=options).response["violations"]
     severe = [violation for violation in violations if violation["impact"] in SEVERE]
     return [f"{one['id']} ({len(one['nodes'])}x): {one['nodes'][0]['html'][:140]}" for one in severe]
 
@@ -159,18 +175,28 @@ def searched(page: Page, address: str) -> list[str]:
 def check(folder: Path, only: str = "") -> dict[str, list[str]]:
     """Return what is wrong with each page of a site; pages with nothing are left out."""
     chosen = [page for page in pages(folder) if only in page]
-    found = {page: dead_links(folder, page) + heavy_videos(folder, page) for page in chosen}
+    site = {page: read(folder, page) for page in pages(folder)}
+    found = {page: dead_links(folder, page, site) + heavy_videos(folder, page, site) for page in chosen}
     found["site"] = missing_files(folder)
-    with served(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
-        for name in tqdm(chosen, desc="pages", disable=not sys.stderr.isatty()):
-            found[name] += _with_new_page(browser, look, address + name)
-        found["search"] = _with_new_page(browser, searched, address)
-        browser.close()
+    with served(folder) as address, ThreadPoolExecutor(BROWSERS) as pool:
+        jobs = [(name, look, address + name) for name in chosen] + [("search", searched, address)]
+        for seen in pool.map(_in_a_browser, [jobs[start::BROWSERS] for start in range(BROWSERS)]):
+            for name, problems in seen.items():
+                found.setdefault(name, []).extend(problems)
     return {name: problems for name, problems in found.items() if problems}
 
 
-def _with_new_page(browser: Browser, do: object, address: str) -> list[str]:
+def _in_a_browser(jobs: list[tuple[str, Look, str]]) -> dict[str, list[str]]:
+    """Do each job on a fresh page of one browser and return what each found."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
+        waiting = tqdm(jobs, desc="pages", disable=not sys.stderr.isatty())
+        found = {name: _with_new_page(browser, do, address) for name, do, address in waiting}
+        browser.close()
+    return found
+
+
+def _with_new_page(browser: Browser, do: Look, address: str) -> list[str]:
     page = browser.new_page()
     try:
         return do(page, address)

@@ -1,6 +1,7 @@
 """A Sphinx extension: no script that would fetch code from elsewhere, or twice, ends up on a page.
 
-It also lets a single page hold the whole book, to be printed.
+It also mends what a screen reader is told of the bibliography, and lets a single page hold the whole book, to be
+printed.
 """
 
 from typing import Any
@@ -14,6 +15,15 @@ def without_unused(app: Sphinx, page: str, template: str, context: dict[str, Any
     """Take scripts and styles of what this book does not use out of a page."""
     for kind in ("script_files", "css_files"):
         context[kind] = [file for file in context.get(kind, []) if UNUSED not in _text(file)]
+
+
+def with_list_items(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object) -> None:
+    """Make the entries of a bibliography what its list says they are.
+
+    docutils gives entries the role doc-biblioentry, which ARIA 1.2 retired in favour of listitem, inside a list: a
+    screen reader then hears of a list without items.
+    """
+    context["body"] = context.get("body", "").replace('role="doc-biblioentry"', 'role="listitem"')
 
 
 def complete_single_page(app: Sphinx) -> None:
@@ -33,5 +43,6 @@ def _text(file: Any) -> str:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect to Sphinx, behind those who add scripts and nodes."""
     app.connect("html-page-context", without_unused, priority=900)
+    app.connect("html-page-context", with_list_items)
     app.connect("builder-inited", complete_single_page)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

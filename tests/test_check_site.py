@@ -85,8 +85,9 @@ def test_a_heavy_video_is_found(tmp_path, inside):
     content = f'<video src="film.mp4"></video><video controls><source src="{source}" type="video/mp4"></video>'
     site = write_site(tmp_path, {"films": content})
     (site / "heavy.mp4").write_bytes(bytes(check_site.VIDEO_BYTES + 1))
-    assert check_site.heavy_videos(site, "films.html") == ["video 2 has 1.0 MB"]
-    assert not check_site.heavy_videos(site, "index.html")
+    facts = {page: check_site.read(site, page) for page in ("films.html", "index.html")}
+    assert check_site.heavy_videos(site, "films.html", facts) == ["video 2 has 1.0 MB"]
+    assert not check_site.heavy_videos(site, "index.html", facts)
 
 
 @pytest.mark.unit
