@@ -23,7 +23,8 @@ def with_list_items(app: Sphinx, page: str, template: str, context: dict[str, An
     docutils gives entries the role doc-biblioentry, which ARIA 1.2 retired in favour of listitem, inside a list: a
     screen reader then hears of a list without items.
     """
-    context["body"] = context.get("body", "").replace('role="doc-biblioentry"', 'role="listitem"')
+    if "body" in context:  # the index and the search have none
+        context["body"] = context["body"].replace('role="doc-biblioentry"', 'role="listitem"')
 
 
 def complete_single_page(app: Sphinx) -> None:

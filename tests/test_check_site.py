@@ -6,6 +6,7 @@ import check_site
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import site_scripts
 
 PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>A page</title>
 <meta name="viewport" content="width=device-width"><link rel="icon" href="data:,"></head>
@@ -94,3 +95,11 @@ def test_a_heavy_video_is_found(tmp_path, inside):
 def test_a_folder_without_a_book_is_refused(tmp_path):
     with pytest.raises(ValueError, match="run make book"):
         check_site.pages(tmp_path)
+
+
+@pytest.mark.unit
+def test_the_entries_of_a_bibliography_are_items_of_its_list():
+    """As docutils writes them."""
+    page = {"body": '<div role="list" class="citation-list"><div class="citation" role="doc-biblioentry"></div></div>'}
+    site_scripts.with_list_items(None, "book/bibliography", "page.html", page, None)
+    assert page["body"].count('role="listitem"') == 1 and "biblioentry" not in page["body"]
