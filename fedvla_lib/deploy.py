@@ -116,6 +116,11 @@ def deployment(
                 superlink.stop(node)
 
 
+def say_at_once(line: str) -> None:
+    """Print a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
 def run_deployed(
     config: Config,
     *,
@@ -123,7 +128,7 @@ def run_deployed(
     auth: bool = True,
     data: Sequence[Path] = (),
     timeout_s: float = 24 * 3600.0,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = say_at_once,
 ) -> Path:
     """Run a federation on a deployment made for the occasion, and return its run folder.
 
@@ -145,9 +150,7 @@ def run_deployed(
     return max(superlink.run_folders(config) - before)
 
 
-def submit(
-    here: Deployment, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None
-) -> None:
+def submit(here: Deployment, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
     """Run the app on a deployment to its end.
 
     Raises:

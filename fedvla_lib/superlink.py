@@ -99,7 +99,10 @@ class SuperLink:
         done = subprocess.run(whole, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
             raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(done.stderr or done.stdout)}")
-        return json.loads(done.stdout[done.stdout.find("{\n") :])
+        answer = json.loads(done.stdout[done.stdout.find("{\n") :])
+        if not answer.get("success", True):
+            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(answer.get('error-message', done.stdout))}")
+        return answer
 
 
 def run_simulation(
@@ -185,7 +188,7 @@ def stage_app(folder: Path) -> Path:
     """
     package = Path(__file__).resolve().parent
     app = folder / "app"
-    shutil.copytree(package, app / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(package, app / package.name, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     if _is_checkout(package.parent):
         for name in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copy(package.parent / name, app / name)

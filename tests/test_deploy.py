@@ -1,21 +1,28 @@
 """A deployment for real: SuperLink and SuperNodes as processes, TLS and keys, the same model, intruders refused."""
 
+import contextlib
+import os
 import re
+import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from conftest import IMAGE_SIZE, heed_interrupts
 from safetensors.numpy import load_file
 
-from fedvla_lib import credentials, deploy, engine, run_folder, superlink
-from fedvla_lib.config import from_profile
+from fedvla_lib import clients, credentials, deploy, engine, record, run_folder, superlink
+from fedvla_lib.cli import build_parser, main
+from fedvla_lib.config import from_profile, to_run_config
 
+ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 
@@ -27,17 +34,22 @@ def tiny(recording, tmp_path):
     )  # fmt: skip
 
 
-def test_a_deployment_gives_the_model_of_the_inline_engine_and_says_what_it_measures(tiny, recording, tmp_path):
-    said = []
-    root = deploy.run_deployed(tiny, tls=True, auth=True, data=[recording] * 2, timeout_s=540, say=said.append)
+def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_from_its_own_data(
+    tiny, recording, tmp_path
+):
+    other = record.record(["lift"], 3, tmp_path / "other", image_size=IMAGE_SIZE, seed=5, progress=False)
+    own, said = [recording, other], []
+    root = deploy.run_deployed(tiny, tls=True, auth=True, data=own, timeout_s=540, say=said.append)
     assert run_folder.read_stamp(root)["status"] == "completed"
     assert run_folder.read_metrics(root, "rejected").empty
     assert any("round 2, client_1, train: loss" in line for line in said)
-    inline = engine.run_inline(tiny, data=[recording] * 2, progress=False, raise_errors=True)
+    inline = engine.run_inline(tiny, data=own, progress=False, raise_errors=True)
     left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
     assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
-    frames = run_folder.read_metrics(root, "train").num_examples
-    assert frames.nunique() == 1  # each holds all of the data set that it was given
+    held = {f"client_{k}": clients.open_client(tiny, k, own_data=str(path)).num_examples for k, path in enumerate(own)}
+    trained = run_folder.read_metrics(root, "train")
+    assert held["client_0"] != held["client_1"]  # all of the data set that each was given
+    assert all(held[who] == frames for who, frames in zip(trained.who, trained.num_examples, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -55,63 +67,113 @@ def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
     assert deploy.CONNECTED not in intruder.log(0).read_text()
 
 
-def test_a_node_that_trusts_another_authority_does_not_talk_to_the_server(standing, tmp_path, monkeypatch):
-    monkeypatch.setattr(superlink, "STARTUP_S", 15.0)
+def refusal(node_of: deploy.Deployment) -> str:
+    """Start a SuperNode of the deployment, and return its log once that says that it does not trust the server."""
+    log = node_of.log(0)
+    log.parent.mkdir(parents=True)
+    node = superlink.start(node_of._command(0), superlink.flower_environment(log.parent), log)
+    try:
+        superlink.wait_until(lambda: "CERTIFICATE_VERIFY_FAILED" in log.read_text(), node, log, "the refusal")
+    finally:
+        superlink.stop(node)
+    return log.read_text()
+
+
+def test_a_node_that_trusts_another_authority_does_not_talk_to_the_server(standing, tmp_path):
     elsewhere = credentials.make_server(tmp_path / "elsewhere")
     astray = replace(standing, link=replace(standing.link, files=elsewhere), nodes={}, folder=tmp_path)
-    with pytest.raises(superlink.FlowerRunError, match="SuperNode of client 0"):
-        astray.start_node(0)
-    for node in astray.nodes.values():
-        superlink.stop(node)
-    assert "CERTIFICATE_VERIFY_FAILED" in astray.log(0).read_text()
+    assert deploy.CONNECTED not in refusal(astray)
 
 
-def test_an_expired_certificate_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(superlink, "STARTUP_S", 15.0)
+def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tmp_path, monkeypatch):
+    """By this library as well: here it is asked only whether somebody listens, so that the others can refuse."""
     expired = credentials.make_server(tmp_path / "server", until=datetime.now(UTC) - timedelta(hours=1))
-    with pytest.raises(superlink.FlowerRunError, match="certificate has expired"):
-        with superlink.local_superlink(tmp_path, files=expired):
-            pass
+    checked = superlink.answers
+    monkeypatch.setattr(superlink, "answers", lambda port, files: not superlink.is_free(port))
+    with superlink.local_superlink(tmp_path, files=expired) as link:
+        assert not checked(link.port, expired)
+        said = refusal(deploy.Deployment(link, tmp_path, [], [], 1))
+        assert "certificate has expired" in said and deploy.CONNECTED not in said
+        with pytest.raises(superlink.FlowerRunError, match="flwr list failed"):  # Flower's command does not say why
+            link.ask("list", superlink.CONNECTION)
 
 
-def test_a_node_killed_during_a_run_is_left_out_and_comes_back(standing, tiny):
-    """Ended without warning after round 1 and started again with its key: rounds go on, and a later one has it back."""
-    config = replace(tiny, num_server_rounds=4, local_steps=2)
-    seen = []
+def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
+    """Ended without warning after round 1, and started again with its key when a round has gone on without it."""
+    config = replace(tiny, num_server_rounds=5, local_steps=2)
+    happened = []
 
     def meddle():
         metrics = [folder / "metrics.jsonl" for folder in superlink.run_folders(config)]
-        trained = [e for file in metrics if file.exists() for e in run_folder.read_events(file) if e["kind"] == "train"]
-        if trained and not seen:
-            seen.append("killed")
+        kinds = {e["kind"] for file in metrics if file.exists() for e in run_folder.read_events(file)}
+        if "train" in kinds and not happened:
             standing.kill_node(1)
-            time.sleep(5)
+            happened.append("killed")
+        if "rejected" in kinds and happened == ["killed"]:
+            happened.append("started again")
             standing.start_node(1)
 
     deploy.submit(standing, config, 900, meddle)
     root = max(superlink.run_folders(config))
-    rejected, trained = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train"))
-    assert seen and run_folder.read_stamp(root)["status"] == "completed"
-    assert set(trained[trained["round"] == 4].who) == {"client_0", "client_1"}
-    assert set(rejected.who) <= {"client_1"}
+    assert happened == ["killed", "started again"] and run_folder.read_stamp(root)["status"] == "completed"
+    rejected, trained, counted = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train", "replies"))
+    assert set(zip(rejected.who, rejected.reason, strict=True)) == {("client_1", "silent")}
+    alone = counted.set_index("round").loc[2]
+    assert (alone.good, alone.rejected, alone.rejected_silent) == (1, 1, 1)
+    who = trained.groupby("round").who.agg(set)
+    assert who[2] == {"client_0"} and who[5] == {"client_0", "client_1"}
 
 
-def test_an_interrupt_stops_everything_that_was_started(tiny, tmp_path):
-    command = [sys.executable, "-c", "import sys; from fedvla_lib.cli import main; sys.exit(main())", "deploy"]
-    command += ["--profile", "tiny", "--clients", "2", "--data", tiny.data, "--tls", "--auth", "--out", str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    said = process.stdout.readline()
-    port = re.search(r"2 SuperNodes joined the SuperLink at 127.0.0.1:(\d+)", said)[1]
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 130 and "interrupted" in process.stderr.read()
-    with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", int(port))) != 0
-    left = subprocess.run(["pgrep", "-f", f"127.0.0.1:{port}"], capture_output=True, text=True).stdout.split()
-    deadline = time.monotonic() + 15  # Flower's helpers look every few seconds whether their parent lives
-    while left and time.monotonic() < deadline:
+def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(standing, tiny, monkeypatch, capsys):
+    """On the processes that stand already: what stops new ones is tested with the interrupt."""
+    monkeypatch.setattr(deploy, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    flags = [f"--{name}={value}" for name, value in given(replace(tiny, min_replies=3)).items()]
+    assert main(["deploy", "--profile", "tiny", "--tls", "--auth", *flags]) == 2
+    said = capsys.readouterr().err
+    assert "2 of 2 clients could be used, min-replies=3 are required" in said and said.count("\n") == 1
+    (root,) = superlink.run_folders(tiny)
+    assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")
+
+
+def given(config):
+    """Settings that differ from those of the profile."""
+    usual = to_run_config(from_profile("tiny"))
+    return {name: value for name, value in to_run_config(config).items() if value != usual[name]}
+
+
+def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_ended(tiny, tmp_path):
+    """The signal goes to the whole group, as a terminal sends it, while round 2 is going on."""
+    config = replace(tiny, num_server_rounds=50)
+    flags = [f"--{name}={value}" for name, value in given(config).items()]
+    command = [sys.executable, "-m", "fedvla_lib.cli", "deploy", "--profile", "tiny", "--tls", "--auth", *flags]
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=buffered, start_new_session=True,
+        preexec_fn=heed_interrupts,
+    )  # fmt: skip
+    port = re.search(r"2 SuperNodes joined the SuperLink at 127.0.0.1:(\d+)", process.stdout.readline())[1]
+    deadline = time.monotonic() + 300
+    while not list(Path(config.out).glob("*/checkpoints/round_1")):
+        assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
+        time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    said, warned = process.communicate(timeout=60)
+    assert process.returncode == 130 and "interrupted: every process is stopped" in warned
+    assert "round 1, client_1, train: loss" in said
+    assert superlink.is_free(int(port)) and not left_over(port)
+    (root,) = superlink.run_folders(config)
+    assert load_file(root / "global_model/round_1/model.safetensors")
+    assert set(run_folder.read_metrics(root, "train").query("round == 1").who) == {"client_0", "client_1"}
+
+
+def left_over(port: str) -> list[str]:
+    """Processes that still name a SuperLink: Flower's helpers look every few seconds whether their parent lives."""
+    deadline = time.monotonic() + 15
+    while True:
+        found = subprocess.run(["pgrep", "-f", f"127.0.0.1:{port}"], capture_output=True, text=True).stdout.split()
+        if not found or time.monotonic() > deadline:
+            return found
         time.sleep(1)
-        left = subprocess.run(["pgrep", "-f", f"127.0.0.1:{port}"], capture_output=True, text=True).stdout.split()
-    assert not left
 
 
 @pytest.mark.unit
@@ -122,3 +184,44 @@ def test_authentication_needs_encryption_and_data_a_folder_for_each_client(tmp_p
         with deploy.deployment(tmp_path, 2, data=[tmp_path]):
             pass
     assert not list(tmp_path.iterdir())
+
+
+def written_commands(program: str) -> list[list[str]]:
+    """Every call of a program in the page on deployment and in the containers, as words."""
+    page = "\n".join(re.findall(r"^```bash\n(.*?)^```", (ROOT / "book/deployment.md").read_text(), re.M | re.S))
+    services = yaml.safe_load((ROOT / "flower/compose.yaml").read_text())["services"].values()
+    lines = [*page.replace("\\\n", " ").splitlines(), *(service["command"] for service in services)]
+    return [words for line in lines if (words := shlex.split(line, comments=True)) and words[0] == program]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("program", ["flower-superlink", "flower-supernode"])
+def test_flowers_programs_know_the_flags_of_the_recipe(program):
+    command = [superlink.program(program), "--help"]
+    help_text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    used = [{word for word in words if word.startswith("--")} for words in written_commands(program)]
+    assert len(used) >= 2 and all(flags for flags in used)
+    assert not set.union(*used) - set(re.findall(r"--[a-z-]+", help_text))
+
+
+@pytest.mark.unit
+def test_the_recipe_calls_commands_that_this_library_has():
+    calls = written_commands("fedvla")
+    assert {words[1] for words in calls} >= {"superlink", "deploy", "credentials", "config"}
+    for words in calls:
+        build_parser().parse_args([word for word in words[1:] if word not in (">", "labs.toml")])
+
+
+@pytest.mark.unit
+def test_the_containers_mount_what_the_recipe_makes(tmp_path, monkeypatch, capsys):
+    """Files that are put into containers come from `fedvla credentials`, as the head of the compose file gives it."""
+    composed = (ROOT / "flower/compose.yaml").read_text()
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(re.search(r"fedvla (credentials .*)", composed)[1])) == 0
+    for service in yaml.safe_load(composed)["services"].values():
+        mounts = [volume.split(":")[:2] for volume in service["volumes"]]
+        made = [tmp_path / "flower" / host for host, _ in mounts if "deployment" in host]
+        assert made and all(path.resolve().exists() for path in made)
+        places = [inside for _, inside in mounts]
+        named = re.findall(r"(?<=[ \"])/[\w./]+", service["command"])
+        assert named and all(any(path.startswith(place) for place in places) for path in named)
