@@ -1,6 +1,7 @@
 """`flwr run` for real: a SuperLink, Flower's simulation runtime with its Ray workers, and this app."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from flwr.cli.config_utils import load_and_validate
 from safetensors.numpy import load_file
 
 from fedvla_lib import engine, run_folder, superlink
+from fedvla_lib.cli import main
 from fedvla_lib.config import from_profile, from_run_config
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
@@ -57,11 +59,16 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
     assert left.keys() == right.keys()
     assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
+    ledgers = [run_folder.read_metrics(one, "replies").query("to == 'train'") for one in (root, inline)]
+    columns = ["round", "good", "sent_bytes", "received_bytes"]
+    np.testing.assert_allclose(*(ledger[columns].astype(float) for ledger in ledgers), rtol=1e-4)
 
 
-def test_a_failed_run_is_an_error_with_flowers_reason(tiny):
-    with pytest.raises(superlink.FlowerRunError, match="finished:failed.*no data set at"):
-        superlink.run_simulation(replace(tiny, data="nowhere/at/all"), timeout_s=300)
+def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsys):
+    flags = ["--profile", "tiny", "--data", "nowhere/at/all", "--out", tiny.out]
+    assert main(["run", "--engine", "simulation", *flags]) == 2
+    said = capsys.readouterr().err
+    assert re.search("finished:failed.*no data set at", said) and said.count("\n") == 1
 
 
 @pytest.mark.unit
