@@ -75,10 +75,14 @@ def report(name: str, rows: list[dict[str, object]], out: Path) -> None:
     for row in rows:
         print("  ".join(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"
                         for key, value in row.items()))  # fmt: skip
-    machine = {"cores": cores(), "python": platform.python_version(), "system": platform.system()}
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / f"{name}.json", {"machine": machine, "rows": json.loads(json.dumps(rows))})
+    write_json(out / f"{name}.json", {"machine": machine(), "rows": json.loads(json.dumps(rows))})
     print(f"-> {name}.json")
+
+
+def machine() -> dict[str, object]:
+    """Return what is told of the machine beside results."""
+    return {"cores": cores(), "python": platform.python_version(), "system": platform.system()}
 
 
 def cores() -> int:

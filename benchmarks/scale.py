@@ -3,7 +3,8 @@
     python benchmarks/scale.py --profile tiny
 
 Every client trains in every round, on one episode, so the work grows with the clients. Scale needs episodes, not
-variety: the profile's recording is repeated until there is one for each client.
+variety: the profile's recording is repeated until there is one for each client. Rows that are measured replace those
+of the same engine and number of clients; the others stay, if they are of a machine like this one.
 """
 
 import json
@@ -21,7 +22,7 @@ import pandas as pd
 import psutil
 from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from report import laptop, options, report, start
+from report import laptop, machine, options, report, start
 
 from fedvla_lib import data, engine, superlink
 from fedvla_lib.config import Config, task_names
@@ -30,6 +31,7 @@ from fedvla_lib.run_folder import GLOBAL, read_events
 MARK = "FEDVLA_BENCHMARK"  # in the environment of every process of one measurement
 ENGINES = {"inline": engine.run_inline, "simulation": superlink.run_simulation}
 MERGED_AT_ONCE = 6
+RATIO = "by client, against fewer clients"
 
 
 def main() -> None:
@@ -44,14 +46,36 @@ def main() -> None:
         wanted = json.loads(chosen.alone)
         ENGINES[wanted.pop("engine")](laptop(chosen.profile, **wanted))
         return
-    rows = []
+    again = {(name, count) for name in chosen.engines for count in chosen.clients}
+    rows = [row for row in kept(chosen.out) if (row["engine"], row["clients"]) not in again]
     with tempfile.TemporaryDirectory() as folder:
         for count in chosen.clients:
             episodes = repeated(laptop(chosen.profile), count, Path(folder) / f"for_{count}")
             for name in chosen.engines:
                 settings = light(episodes, count, chosen.rounds, Path(folder) / f"{name}_{count}")
                 rows.append({"engine": name, "clients": count, **measure({"engine": name, **settings}, chosen.profile)})
-                report("scale", rows, chosen.out)  # each time: the last are long, and what is known is kept
+                report("scale", compared(rows), chosen.out)  # each time: the last are long, what is known is kept
+
+
+def kept(out: Path) -> list[dict[str, object]]:
+    """Return the rows of an earlier call on a machine like this one."""
+    file = out / "scale.json"
+    earlier = json.loads(file.read_text()) if file.is_file() else {"machine": machine(), "rows": []}
+    return earlier["rows"] if earlier["machine"] == machine() else []
+
+
+def compared(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+    """Sort rows by engine and clients, and set each one's cost by client against that of the row with fewer clients.
+
+    One is a flat cost; ten times the clients at a cost that grows with their square would give ten.
+    """
+    whole, before = [], {}
+    for row in sorted(rows, key=lambda row: (list(ENGINES).index(row["engine"]), row["clients"])):
+        cost = row["later rounds, by client [ms]"]
+        ratio = cost / before[row["engine"]] if row["engine"] in before else None
+        whole.append({**{k: v for k, v in row.items() if k != RATIO}, RATIO: ratio})
+        before[row["engine"]] = cost
+    return whole
 
 
 def repeated(config: Config, count: int, folder: Path) -> Path:

@@ -344,6 +344,8 @@ def _benchmark_tables(files: list[Path]) -> str:
 
 
 def _number(value: object) -> str:
+    if value is None:
+        return ""
     if not isinstance(value, float):
         return str(value)
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -76,9 +76,13 @@ def test_a_federation_is_measured_against_its_clients(tmp_path):
 
 
 def test_rounds_are_timed_for_each_number_of_clients(tmp_path):
-    rows = run("scale", tmp_path, "--clients", "2", "13", "--engines", "inline")
+    (before,) = run("scale", tmp_path, "--clients", "2", "--engines", "inline")
+    rows = run("scale", tmp_path, "--clients", "13", "--engines", "inline")
     assert [row["clients"] for row in rows] == [2, 13]  # more than the recording has episodes
+    assert rows[0] == before  # measured once, and kept
     assert all(row["later rounds [s]"] > 0 and row["peak memory [MB]"] > 100 for row in rows)
+    few, many = (row["later rounds, by client [ms]"] for row in rows)
+    assert [row["by client, against fewer clients"] for row in rows] == [None, pytest.approx(many / few)]
 
 
 def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path):
