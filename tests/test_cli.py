@@ -152,6 +152,14 @@ def test_run_prints_the_rounds_and_the_run_folder(tmp_path, capsys):
 
 
 @pytest.mark.integration
+def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(recording, tmp_path, capfd):
+    flags = ["--profile", "tiny", "--data", str(recording), "--min-replies", "9", "--out", str(tmp_path)]
+    assert main(["run", *flags]) == 2
+    said = capfd.readouterr().err.splitlines()[-1]
+    assert said.startswith("fedvla run: 3 of 3 clients could be used, min-replies=9 are required")
+
+
+@pytest.mark.integration
 @pytest.mark.skipif(os.name != "posix", reason="sends a POSIX signal")
 def test_ctrl_c_keeps_complete_episodes_and_the_recording_goes_on(tmp_path):
     root = tmp_path / "demos"

@@ -2,15 +2,19 @@
 
 import contextlib
 import json
+import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
+from conftest import heed_interrupts
 from safetensors.numpy import load_file, save_file
 
 from fedvla_lib import checkpoint, engine, run_folder, superlink
@@ -30,27 +34,55 @@ def tiny(recording, tmp_path):
     )  # fmt: skip
 
 
-def start_and_kill(config, round_number, engine_name="inline"):
-    """Run in processes of its own and end all without warning while clients train in a round; return the run folder."""
+def start_until(config, round_number, engine_name="inline"):
+    """Run in processes of their own until clients train in a round; return the process and the run folder."""
     told = {key: value for key, value in to_run_config(config).items() if key != "resume" and value != ""}
     switches = [f"--{key}" if value else f"--no-{key}" for key, value in told.items() if isinstance(value, bool)]
     values = [f"--{key}={value}" for key, value in told.items() if not isinstance(value, bool)]
     process = subprocess.Popen(
         [sys.executable, "-c", MAIN, "run", "--engine", engine_name, *switches, *values],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=heed_interrupts,
     )  # fmt: skip
     deadline = time.monotonic() + 300
-    while time.monotonic() < deadline and process.poll() is None:
-        folders = superlink.run_folders(config)
-        # The round before has its checkpoint, so the next has begun.
-        if folders and (max(folders) / f"checkpoints/round_{round_number - 1}").exists():
-            for one in [*psutil.Process(process.pid).children(recursive=True), process]:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    one.send_signal(signal.SIGKILL)
-            break
+    # The round before has its checkpoint, so the next has begun.
+    while not (found := list(Path(config.out).glob(f"*/checkpoints/round_{round_number - 1}"))):
+        assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
         time.sleep(0.005)
+    return process, found[0].parents[1]
+
+
+def start_and_kill(config, round_number, engine_name="inline"):
+    """End everything without warning while clients train in a round, as in a power cut; return the run folder."""
+    process, root = start_until(config, round_number, engine_name)
+    for one in [*psutil.Process(process.pid).children(recursive=True), process]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            one.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    return max(superlink.run_folders(config))
+    assert run_folder.read_stamp(root)["status"] == "running"  # nobody was left to say otherwise
+    return root
+
+
+def start_and_interrupt(config, round_number):
+    """Press Ctrl-C while clients train in a round: a terminal sends the signal to the whole group."""
+    process, root = start_until(config, round_number)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and "interrupted: the rounds that ended stay in the run folder" in said
+    assert run_folder.read_stamp(root)["status"] == "interrupted"
+    return root
+
+
+def start_and_fill_the_disk(config, round_number):
+    """From a round on the process can write no file as large as a model, as on a disk without room for it."""
+    if not hasattr(resource, "prlimit"):
+        pytest.skip("only Linux limits a process that runs")
+    process, root = start_until(config, round_number)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
+    last = process.communicate(timeout=60)[1].splitlines()[-1]  # before it are the bars of progress
+    assert process.returncode == 2 and last.startswith(f"fedvla run: cannot write {root}/")
+    assert "failed: OSError: cannot write" in run_folder.read_stamp(root)["status"]
+    return root
 
 
 def last_model(root, rounds=4):
@@ -65,14 +97,18 @@ def assert_same_bits(left, right):
 @pytest.mark.integration
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "settings", [{"strategy": "fedavg"}, KEEPING, {"strategy": "fedavgm"}],
-    ids=lambda settings: settings["strategy"],
-)  # fmt: skip
-def test_a_killed_run_ends_in_the_same_bits(tiny, settings, capsys):
+    ("settings", "start_and_end"),
+    [
+        ({"strategy": "fedavg"}, start_and_fill_the_disk),
+        (KEEPING, start_and_kill),
+        ({"strategy": "fedavgm"}, start_and_interrupt),
+    ],
+    ids=["full disk", "killed", "interrupted"],
+)
+def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end):
     config = replace(tiny, **settings)
     whole = engine.run_inline(config, progress=False)
-    root = start_and_kill(replace(config, out=config.out + "_killed"), 3)
-    assert run_folder.read_stamp(root)["status"] == "running"  # nobody was left to say otherwise
+    root = start_and_end(replace(config, out=config.out + "_ended"), 3)
     assert main(["run", "--resume", str(root)]) == 0
     assert_same_bits(last_model(root), last_model(whole))
     assert run_folder.read_stamp(root)["status"] == "completed" and run_folder.read_stamp(root)["resumed"]
@@ -88,7 +124,6 @@ def test_a_simulation_killed_whole_goes_on_and_ends_in_the_same_bits(tiny):
     whole = engine.run_inline(tiny, progress=False)
     config = replace(tiny, out=tiny.out + "_killed")
     root = start_and_kill(config, 2, "simulation")
-    assert run_folder.read_stamp(root)["status"] == "running"
     assert superlink.run_simulation(replace(config, resume=str(root))) == root
     assert_same_bits(last_model(root), last_model(whole))
     assert run_folder.read_stamp(root)["status"] == "completed"
