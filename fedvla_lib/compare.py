@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.optimize import brentq
-from scipy.stats import bootstrap, norm, permutation_test, t
+from scipy.stats import norm, permutation_test, t
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.proportion import proportion_confint, proportion_effectsize
+from statsmodels.stats.proportion import proportion_confint
 
 CONFIDENCE = 0.95
 POWER = 0.8
+DISTINCT = 8  # different values that a bootstrap of a mean needs
 
 
 def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -58,7 +59,7 @@ def paired(rows: pd.DataFrame, arm: str, other: str) -> pd.DataFrame:
 def paired_difference(
     rows: pd.DataFrame, arm: str, other: str, *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
-    """Difference in success rate `arm` - `other` over the same rollouts, with a paired bootstrap interval.
+    """Difference in success rate `arm` - `other` over the same rollouts, with the interval of `success_difference`.
 
     Also McNemar's exact test on the discordant pairs (McNemar 1947): `only_arm` and `only_other` are the rollouts that
     one arm alone solved.
@@ -72,23 +73,24 @@ def paired_difference(
 def success_difference(
     left: Sequence[bool], right: Sequence[bool], *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
-    """Difference of two success rates over the same attempts: left - right, bootstrap interval, McNemar's exact test.
+    """Difference of two success rates over the same attempts: left - right, Student's interval, McNemar's exact test.
+
+    The interval is for independent attempts of one pair of models; with a handful of unequal outcomes it is rough.
 
     Returns:
-        n: pairs; difference, low, high; only_left, only_right: attempts that one of them alone solved; p_value;
-        effect: Cohen's h (Cohen 1988), the difference of the rates' arcsine transforms; visible: the smallest
-        difference that n pairs with this share of unequal outcomes would show with a power of 80 %.
+        n: pairs; difference, low, high: the effect, in the measure's own unit; visible: the smallest difference that n
+        pairs with this share of unequal outcomes would show with a power of 80 %; only_left, only_right: attempts that
+        one of them alone solved; p_value.
     """
     left, right = np.asarray(left, bool), np.asarray(right, bool)
     table = [[int((left & right).sum()), int((left & ~right).sum())],
              [int((~left & right).sum()), int((~left & ~right).sum())]]  # fmt: skip
-    low, high = bootstrap_mean(left.astype(float) - right, seed=seed, confidence=confidence)
+    low, high = mean_interval(left.astype(float) - right, seed=seed, confidence=confidence)
     only_left, only_right = table[0][1], table[1][0]
     return {
         "n": len(left), "difference": float(left.mean() - right.mean()), "low": low, "high": high,
-        "only_left": only_left, "only_right": only_right, "p_value": float(mcnemar(table, exact=True).pvalue),
-        "effect": float(proportion_effectsize(left.mean(), right.mean())),
         "visible": smallest_difference(len(left), (only_left + only_right) / len(left), confidence),
+        "only_left": only_left, "only_right": only_right, "p_value": float(mcnemar(table, exact=True).pvalue),
     }  # fmt: skip
 
 
@@ -98,18 +100,17 @@ def mean_difference(
     """Difference of two means over the same units: left - right, paired bootstrap, test by turning signs of pairs.
 
     Returns:
-        n: pairs; difference, low, high; p_value (Fisher 1935: if left and right were alike, each difference could as
-        well have the other sign); effect: Cohen's d of the pairs; visible: the smallest difference that n pairs which
-        spread like these would show with a power of 80 %.
+        n: pairs; difference, low, high: the effect, in the measure's own unit; visible: the smallest difference that n
+        pairs which spread like these would show with a power of 80 %; p_value (Fisher 1935: if left and right were
+        alike, each difference could as well have the other sign).
     """
     each = np.asarray(left, float) - np.asarray(right, float)
-    low, high = bootstrap_mean(each, seed=seed, confidence=confidence)
+    low, high = mean_interval(each, seed=seed, confidence=confidence)
     spread = float(each.std(ddof=1)) if len(each) > 1 else 0.0
     reach = sum(norm.ppf([1 - (1 - confidence) / 2, POWER]))
     return {
         "n": len(each), "difference": float(each.mean()), "low": low, "high": high,
-        "p_value": _sign_test(each, seed), "effect": float(each.mean() / spread) if spread else float("nan"),
-        "visible": float(reach * spread / np.sqrt(len(each))),
+        "visible": float(reach * spread / np.sqrt(len(each))), "p_value": _sign_test(each, seed),
     }  # fmt: skip
 
 
@@ -144,14 +145,30 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     return multipletests(p_values, method="holm")[1]
 
 
-def bootstrap_mean(values: np.ndarray, *, seed: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Percentile bootstrap interval of a mean (Efron 1979); a constant sample gives an interval of width zero."""
+def mean_interval(
+    values: np.ndarray, *, seed: int, confidence: float = CONFIDENCE, resamples: int = 9999
+) -> tuple[float, float]:
+    """Interval of a mean of independent values: studentised bootstrap (Efron 1979; Hall 1988), or Student's.
+
+    Each resample's distance from the mean is counted in its own standard errors, which follows a skewed sample where
+    other bootstraps do not. Simulated with known truth, 12 values cover it 95 % of the time if normal, 94 % if
+    exponential and 91 % if lognormal with a spread of 1; the percentile bootstrap 91, 87 and 82 %, BCa 91, 88 and 84 %.
+    Fewer than `DISTINCT` different values, as of successes, leave too few resamples that differ: those get Student's,
+    which for 39 or more differences of paired outcomes covers 94 to 96 %. A constant sample gives a width of zero.
+    """
     values = np.asarray(values, float)
-    if len(values) < 2 or np.ptp(values) == 0:
-        return float(values.mean()), float(values.mean())
-    rng = np.random.default_rng(seed)
-    interval = bootstrap((values,), np.mean, confidence_level=confidence, method="percentile", rng=rng)
-    return float(interval.confidence_interval.low), float(interval.confidence_interval.high)
+    count, mean = len(values), float(np.mean(values))
+    if count < 2 or np.ptp(values) == 0:
+        return mean, mean
+    ends, error = [(1 + confidence) / 2, (1 - confidence) / 2], values.std(ddof=1) / np.sqrt(count)
+    if len(np.unique(values)) < DISTINCT:
+        far = t.ppf(ends, count - 1)
+    else:
+        drawn = np.random.default_rng(seed).choice(values, (resamples, count))
+        spread = drawn.std(axis=1, ddof=1)
+        apart = (drawn.mean(axis=1) - mean)[spread > 0] / spread[spread > 0]
+        far = np.sqrt(count) * np.quantile(apart, ends)
+    return mean - float(far[0] * error), mean - float(far[1] * error)
 
 
 def by_run(rows: pd.DataFrame) -> pd.DataFrame:
@@ -198,9 +215,10 @@ def difference_over_seeds(
         raise ValueError(f"{arm!r} and {other!r} differ in training seeds or attempts: they cannot be paired")
     pairs = success_difference(left.to_numpy().ravel(), right.to_numpy().ravel(), seed=seed, confidence=confidence)
     low, high = crossed_bootstrap(left - right, seed=seed, confidence=confidence)
-    known = {key: pairs[key] for key in ("n", "only_left", "only_right", "effect")}
-    return {"arm": arm, "other": other, **over_seeds(left - right, confidence), **known,
-            "boot_low": low, "boot_high": high, "mcnemar_p": pairs["p_value"]}  # fmt: skip
+    known = {key: pairs[key] for key in ("n", "only_left", "only_right")}
+    found = over_seeds(left - right, confidence)
+    p_values = {"p_value": found.pop("p_value"), "mcnemar_p": pairs["p_value"]}
+    return {"arm": arm, "other": other, **found, "boot_low": low, "boot_high": high, **known, **p_values}
 
 
 def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str, float]:
@@ -209,7 +227,7 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
     Every seed makes every attempt, so the variance has three parts: between seeds, between attempts of a task, and the
     rest. With S seeds and n attempts the variance of the mean is (MS_seeds + MS_attempts - MS_rest) / (S n), its
     degrees of freedom are Satterthwaite's (1946), and the interval is Student's. Simulated with known truth, 5 seeds
-    and 100 attempts cover it 94 to 97 % of the time; a bootstrap of so few seeds is too narrow where seeds matter and
+    and 100 attempts cover it 93 to 97 % of the time; a bootstrap of so few seeds is too narrow where seeds matter and
     too wide where they do not.
 
     Args:
@@ -250,6 +268,10 @@ def crossed_bootstrap(
     values: pd.DataFrame, *, seed: int, confidence: float = CONFIDENCE, resamples: int = 2000
 ) -> tuple[float, float]:
     """Percentile interval of the mean from drawing training seeds, and attempts within tasks (Owen 2007).
+
+    With 5 training seeds it does not keep its word, so `over_seeds` is what is reported and this stands beside it:
+    simulated, it contains a known truth 99 % of the time where seeds are alike and 93 % where they differ much; the
+    more they differ, the less.
 
     Source: the pigeonhole bootstrap, doi 10.1214/07-AOAS122: lines and columns are drawn apart from each other.
     """

@@ -18,9 +18,11 @@ SUCCESS = "success_rate"
 METRICS = ("loss", "action_error", "action_accuracy", SUCCESS)
 WHOLE = ("global", "local")  # whose measurements are of a run's one model
 ATTEMPT = ["task", "lab", "seed"]
+LAST = ["p_value", "p_holm", "mismatch"]  # columns after the effect and its interval
 # Settings that decide what is measured, or from where training starts.
 ALIKE = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction", "base", "chunk_size",
          "batch_size", "action_tolerance_deg")  # fmt: skip
+IN_LOSS = ("normalisation",)  # decides the unit of the loss, though not of what the arm does
 
 
 @dataclass(frozen=True)
@@ -67,19 +69,30 @@ def _gradient_steps(folder: Path, config: Config) -> int:
 
 def mismatches(runs: Sequence[Run], metrics: Sequence[str]) -> list[str]:
     """Return what makes runs incomparable with the first, one line each; none if they can be compared."""
-    return [line for run in runs[1:] for line in _mismatches(runs[0], run, metrics)]
+    return [
+        f"{runs[0].name} and {run.name} differ in {what}: {how}"
+        for run in runs[1:]
+        for what, how in _mismatches(runs[0], run, metrics).items()
+    ]
 
 
-def _mismatches(first: Run, other: Run, metrics: Sequence[str]) -> list[str]:
-    pairs = [(name.replace("_", "-"), getattr(first.config, name), getattr(other.config, name)) for name in ALIKE]
+def _mismatches(first: Run, other: Run, metrics: Sequence[str]) -> dict[str, str]:
+    """What differs, and how."""
+    alike = ALIKE + IN_LOSS * ("loss" in metrics)
+    pairs = [(name.replace("_", "-"), getattr(first.config, name), getattr(other.config, name)) for name in alike]
     pairs.append(("gradient steps", first.gradient_steps, other.gradient_steps))
-    found = [f"{name}: {left!r} and {right!r}" for name, left, right in pairs if left != right]
+    found = {name: f"{left!r} and {right!r}" for name, left, right in pairs if left != right}
     if set(metrics) - {SUCCESS} and set(first.episodes.index) != set(other.episodes.index):
-        found.append(f"held-out episodes: {list(first.episodes.index)} and {list(other.episodes.index)}")
+        found["held-out episodes"] = f"{list(first.episodes.index)} and {list(other.episodes.index)}"
     if SUCCESS in metrics and _keys(first) != _keys(other):
         ours, theirs = _keys(first), _keys(other)
-        found.append(f"rollouts: {len(ours)} and {len(theirs)}, of which {len(ours & theirs)} are common")
-    return [f"{first.name} and {other.name} differ in {line}" for line in found]
+        found["rollouts"] = f"{len(ours)} and {len(theirs)}, of which {len(ours & theirs)} are common"
+    return found
+
+
+def _label(first: Run, other: Run, metric: str) -> str:
+    """Name what makes a line of a table incomparable, for whoever sees the table alone; empty if nothing does."""
+    return ", ".join(_mismatches(first, other, [metric]))
 
 
 def _keys(run: Run) -> set[tuple[Any, ...]]:
@@ -87,18 +100,23 @@ def _keys(run: Run) -> set[tuple[Any, ...]]:
 
 
 def values(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confidence: float) -> pd.DataFrame:
-    """Return a row for each run and metric: n, value, low, high (Wilson for success, else bootstrap over episodes)."""
+    """Return a row for each run and metric: n, value, low, high (Wilson for success, else bootstrap over episodes).
+
+    The column mismatch names what makes the value incomparable with the first run's.
+    """
     rows = []
     for run in runs:
-        known = {"run": run.name, "gradient_steps": run.gradient_steps}
-        rows += [{**known, "metric": metric, **_value(run, metric, seed, confidence)} for metric in metrics]
+        for metric in metrics:
+            known = {"run": run.name, "gradient_steps": run.gradient_steps, "metric": metric}
+            found = _value(run, metric, seed, confidence)
+            rows.append({**known, **found, "mismatch": _label(runs[0], run, metric)})
     return pd.DataFrame(rows)
 
 
 def _value(run: Run, metric: str, seed: int, confidence: float) -> dict[str, float]:
     if metric != SUCCESS:
         each = run.episodes[metric].to_numpy()
-        low, high = compare.bootstrap_mean(each, seed=seed, confidence=confidence)
+        low, high = compare.mean_interval(each, seed=seed, confidence=confidence)
         return {"n": len(each), "value": float(each.mean()), "low": low, "high": high}
     if run.attempts.empty:
         raise ValueError(f"{run.name} made no attempt: run it with eval-rollouts above 0, or leave out {SUCCESS}")
@@ -110,16 +128,20 @@ def _value(run: Run, metric: str, seed: int, confidence: float) -> dict[str, flo
 def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confidence: float) -> pd.DataFrame:
     """Return a row for each metric and each run but the first, that run minus the first, over what both measured.
 
-    The p-values of the table are one family; `p_holm` are Holm's (1979). `visible` is the smallest difference that so
-    many pairs would have shown with a power of 80 %.
+    The effect comes first: the difference in the metric's own unit with its interval, a paired bootstrap over held-out
+    episodes or attempts, and `visible`, the smallest difference that so many pairs would have shown with a power of
+    80 %. Then p-values: those of the table are one family, and `p_holm` are Holm's (1979). `mismatch` names what makes
+    the two incomparable.
     """
     rows, first = [], runs[0]
     for metric in metrics:
         for run in runs[1:]:
             found = _difference(run, first, metric, seed, confidence)
-            rows.append({"run": run.name, "against": first.name, "metric": metric, **found})
+            label = {"mismatch": _label(first, run, metric)}
+            rows.append({"run": run.name, "against": first.name, "metric": metric, **found, **label})
     table = pd.DataFrame(rows)
-    return table.assign(p_holm=compare.holm(table.p_value))
+    table = table.assign(p_holm=compare.holm(table.p_value))
+    return table[[name for name in table if name not in LAST] + LAST]
 
 
 def _difference(run: Run, first: Run, metric: str, seed: int, confidence: float) -> dict[str, Any]:

@@ -12,6 +12,9 @@ from fedvla_lib import compare, run_folder
 
 OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
 OF_RUN = ("partition", "arm", "run")
+BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
+HELD_OUT = ("loss", "action_error")
+P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
 
 def read_results(folder: Path) -> pd.DataFrame:
@@ -41,8 +44,27 @@ def _known(cell: Path) -> dict[str, Any]:
 def _attempts(cell: Path) -> pd.DataFrame:
     rows = run_folder.read_metrics(cell, "rollout")
     last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
-    measured = {name: float(last.get(name, "nan")) for name in ("loss", "action_error")}
+    measured = {name: float(last.get(name, "nan")) for name in HELD_OUT}
     return rows[rows["round"] == last["round"]].assign(**_known(cell), **measured)
+
+
+def lend(rows: pd.DataFrame, partitions: Sequence[str]) -> pd.DataFrame:
+    """Return the rows, and those of arms that see no partition once more for each partition of the recording.
+
+    Base and centralized training come out the same however a recording is dealt out, so they are measured with one of
+    its partitions; to the others they are lent, for the same seeds and attempts.
+
+    Args:
+        rows: of `read_results`.
+        partitions: those of one recording. What has no row, or has an arm itself, is lent nothing.
+    """
+    there = rows[rows.partition.isin(partitions)]
+    lent = []
+    for _, measured in there[there.kind.isin(BLIND)].groupby("arm", sort=False):
+        lender = measured[measured.partition == measured.partition.iloc[0]]
+        lacking = [name for name in there.partition.unique() if name not in set(measured.partition)]
+        lent += [lender.assign(partition=name) for name in lacking]
+    return pd.concat([rows, *lent], ignore_index=True)
 
 
 def read_rounds(folder: Path) -> pd.DataFrame:
@@ -150,8 +172,9 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.
 def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
     """Return a line for each partition and pair of arms that both have: `compare.difference_over_seeds` of success.
 
-    Only training seeds that both arms have are used. `loss` is the difference of held-out losses with loss_low and
-    loss_high, Student's over training seeds. The p-values of the table are one family; `p_holm` are Holm's (1979).
+    Only training seeds that both arms have are used. `loss` and `action_error` are differences of held-out averages,
+    with loss_low, loss_high and so on: Student's over training seeds. P-values come last; those of the table are one
+    family, and `p_holm` are Holm's (1979).
     """
     lines = []
     for partition, part in rows.groupby("partition", sort=False):
@@ -160,12 +183,18 @@ def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: i
             if len(shared) > 1:
                 both = part[part.run.isin(shared)]
                 found = compare.difference_over_seeds(both, arm, other, seed=seed)
-                lines.append({"partition": partition, "seeds": len(shared), **found, **_of_losses(both, arm, other)})
+                lines.append({"partition": partition, "seeds": len(shared), **found, **_held_out(both, arm, other)})
+    if not lines:
+        return pd.DataFrame()
     table = pd.DataFrame(lines)
-    return table.assign(p_holm=compare.holm(table.p_value)) if lines else table
+    table = table.assign(p_holm=compare.holm(table.p_value))
+    return table[[name for name in table if name not in P_VALUES] + P_VALUES]
 
 
-def _of_losses(rows: pd.DataFrame, arm: str, other: str) -> dict[str, float]:
-    losses = rows.groupby(["arm", "run"]).loss.first()
-    found = compare.over_seeds((losses[arm] - losses[other]).to_frame())
-    return {"loss": found["difference"], "loss_low": found["low"], "loss_high": found["high"]}
+def _held_out(rows: pd.DataFrame, arm: str, other: str) -> dict[str, float]:
+    found = {}
+    for name in HELD_OUT:
+        each = rows.groupby(["arm", "run"])[name].first()
+        over = compare.over_seeds((each[arm] - each[other]).to_frame())
+        found |= {name: over["difference"], f"{name}_low": over["low"], f"{name}_high": over["high"]}
+    return found

@@ -88,7 +88,7 @@ def by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.DataFrame:
         if metric == "success_rate":
             low, high = compare.wilson(int(each.sum()), len(each))
         elif len(each):
-            low, high = compare.bootstrap_mean(each, seed=seed)
+            low, high = compare.mean_interval(each, seed=seed)
         value = float(each.mean()) if len(each) else float("nan")
         lines.append({"round": number, "metric": metric, "n": len(each), "value": value, "low": low, "high": high})
     return pd.DataFrame(lines)

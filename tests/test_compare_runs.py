@@ -1,6 +1,7 @@
 """`fedvla compare` on real runs: the same attempts and episodes line up, and what cannot be compared is refused."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pandas as pd
@@ -28,6 +29,19 @@ def runs(recording, tmp_path_factory):
     return folders
 
 
+def copied(run, out, *, settings=None, kind="", name="", change=lambda value: value):
+    """A copy of a run with other settings, or with a value changed in its events of a kind."""
+    shutil.copytree(run, out)
+    config = json.loads((out / "config.json").read_text()) | (settings or {})
+    (out / "config.json").write_text(json.dumps(config))
+    events = run_folder.read_events(out / "metrics.jsonl")
+    for event in events:
+        if event["kind"] == kind:
+            event["values"][name] = change(event["values"][name])
+    (out / "metrics.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+    return out
+
+
 def test_runs_are_compared_attempt_by_attempt_and_episode_by_episode(runs, tmp_path, capsys):
     names = ["fedavg", "median"]
     assert main(["compare", *(str(runs[name]) for name in names), "--out", str(tmp_path)]) == 0
@@ -44,6 +58,11 @@ def test_runs_are_compared_attempt_by_attempt_and_episode_by_episode(runs, tmp_p
     found = differences.set_index("metric").difference
     pd.testing.assert_series_equal(found.sort_index(), expected.sort_index(), check_names=False)
     assert (differences.p_holm >= differences.p_value).all()
+    effect, rest = ["difference", "low", "high", "visible"], ["p_value", "p_holm"]
+    assert [name for name in differences if name in effect + rest] == effect + rest  # what is large before what is rare
+    header = next(line for line in said.splitlines() if "difference" in line).split()
+    assert [name for name in header if name in effect + rest] == effect + rest
+    assert differences[effect[:3]].notna().all(axis=None) and differences.mismatch.isna().all()
     assert (tmp_path / "differences.png").stat().st_size > 1000
     assert json.loads((tmp_path / "comparison.json").read_text())["mismatches"] == []
 
@@ -64,6 +83,56 @@ def test_runs_that_spent_different_things_are_refused_unless_asked(runs, tmp_pat
     assert main([*arguments, "--allow-mismatch", "--out", str(tmp_path)]) == 0
     assert "MISMATCH: fedavg and longer differ in gradient steps: 4 and 6" in capsys.readouterr().out
     assert json.loads((tmp_path / "comparison.json").read_text())["mismatches"]
+
+
+OTHER = {  # what another run has otherwise, what the refusal says of it, and the pairs that are left
+    "held-out set": (
+        {"kind": "held-out", "name": "episode_id", "change": lambda i: i + 100 * (i % 3 == 0)}, "loss",
+        "held-out episodes", {"loss": 2},
+    ),
+    "rollout seeds": (
+        {"kind": "rollout", "name": "seed", "change": lambda seed: seed + 1}, "success_rate,loss", "rollouts",
+        {"success_rate": 3, "loss": 3},
+    ),
+    "share held out": ({"settings": {"val_fraction": 0.25}}, "loss", "val-fraction: 0.1 and 0.25", {"loss": 3}),
+    "unit of the loss": (
+        {"settings": {"normalisation": "none"}}, "loss,success_rate", "normalisation: 'pooled' and 'none'",
+        {"loss": 3, "success_rate": 6},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("other", OTHER)
+def test_what_cannot_be_compared_is_refused_by_name_and_labelled_if_asked_for(runs, other, tmp_path, capsys):
+    change, metrics, words, pairs = OTHER[other]
+    theirs = copied(runs["median"], tmp_path / "other", **change)
+    arguments = ["compare", str(runs["fedavg"]), str(theirs), "--metrics", metrics, "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert len(said.err.splitlines()) == 1 and f"fedavg and other differ in {words}" in said.err
+    assert said.err.count("differ in") == 1 and not said.out and not (tmp_path / "out").exists()
+
+    assert main([*arguments, "--allow-mismatch"]) == 0
+    what, said = words.split(":")[0], capsys.readouterr().out
+    assert f"MISMATCH: fedavg and other differ in {words}" in said
+    table = pd.read_csv(tmp_path / "out" / "differences.csv").set_index("metric")
+    kept = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert table.n.to_dict() == pairs and any(words in line for line in kept["mismatches"])
+    labelled = {row["metric"] for row in kept["differences"] if row["mismatch"] == what}
+    concerned = {"rollouts": {"success_rate"}, "normalisation": {"loss"}}.get(what, {"loss"})
+    assert labelled == set(table.index[table.mismatch == what]) == concerned
+    assert sum(line.endswith(what) for line in said.splitlines()) == 2 * len(concerned)  # values, and differences
+    values = pd.read_csv(tmp_path / "out" / "values.csv", keep_default_na=False)
+    assert set(values[values.run == "fedavg"].mismatch) == {""}
+    assert set(values[values.mismatch == what].metric) == concerned
+
+
+def test_runs_without_a_common_attempt_leave_nothing_to_compare(runs, tmp_path, capsys):
+    theirs = copied(runs["median"], tmp_path / "other", kind="rollout", name="seed", change=lambda seed: seed + 1000)
+    arguments = ["compare", str(runs["fedavg"]), str(theirs), "--metrics", "success_rate", "--allow-mismatch"]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "other and fedavg share no attempt" in said and len(said.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import arms, clients, experiment, results, run_folder
+from fedvla_lib import arms, clients, data, experiment, results, run_folder
 from fedvla_lib.cli import main
 from fedvla_lib.clients import CLIENT_SEEDS
 from fedvla_lib.config import from_profile, task_names
@@ -90,6 +90,15 @@ def test_a_file_that_cannot_be_used_is_named_with_the_remedy(file, change, messa
     assert not (file.parent / "out").exists()
 
 
+def printed_table(said, column):
+    """The printed table that has a column of this name, by arm."""
+    lines = said.splitlines()
+    start = next(number for number, line in enumerate(lines) if column in line.split())
+    names, rows = lines[start].split(), [line.split() for line in lines[start + 1 :]]
+    table = pd.DataFrame([row for row in rows if len(row) == len(names)], columns=names).set_index("arm")
+    return table.drop(columns="partition").astype(float)
+
+
 @pytest.mark.integration
 def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, capsys):
     grid = tomllib.loads(GRID)
@@ -106,7 +115,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     before = {path.name: (path / "stamp.json").stat().st_mtime_ns for path in out.iterdir()}
     assert main(["experiment", str(file), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "5 cells, 2 of them in" in said and "gradient_steps" in said  # a table at the end shows what each arm spent
+    assert "5 cells, 2 of them in" in said
     assert all((out / name / "stamp.json").stat().st_mtime_ns == time for name, time in before.items())
 
     rows = results.read_results(out)
@@ -120,6 +129,12 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     travelled = rows.groupby("arm").bytes.first()
     assert travelled["averaged"] > 1e6 and travelled["pooled"] == travelled["start"] == 0
     assert rows.groupby("arm").loss.first().nunique() == 4
+    spent = printed_table(said, "gradient_steps")  # what is equal, and what is not, stands in the table at the end
+    learned = ["averaged", "pooled", "alone"]
+    assert spent.loc[learned, "gradient_steps"].tolist() == [steps["averaged"]] * 3
+    assert spent.loc[learned, "samples"].tolist() == [steps["averaged"] * plan.cells[0].config.batch_size] * 3
+    assert spent.MB["averaged"] == pytest.approx(travelled["averaged"] / 1e6, abs=1e-3) and spent.MB["pooled"] == 0
+    assert (spent.loc[learned, "train_s"] > 0).all() and spent.loc["start", ["samples", "train_s"]].tolist() == [0, 0]
     stamp = run_folder.read_stamp(out / "mixed_averaged_0")
     assert stamp["status"] == "completed" and stamp["commit"] and stamp["code"] and stamp["wall_s"] > 0
     pooled = run_folder.read_stamp(out / "mixed_pooled_0")
@@ -139,6 +154,44 @@ def test_attempts_start_where_no_demonstration_and_no_look_during_training_did(f
     shown = {demonstration_seed(0, index, attempt) for index in episodes for attempt in range(MAX_ATTEMPTS)}
     during_training = range(FIRST_SEED, FIRST_SEED + CLIENT_SEEDS * (config.num_clients + 1))
     assert not set(plan.rollout_seeds) & (shown | set(during_training))
+
+
+@pytest.fixture
+def handed_out(monkeypatch):
+    """The episodes behind each training batch that is drawn, whoever draws it."""
+    episodes, rows_at = [], data.Batches.rows_at
+
+    def noting(batches, step):
+        rows = rows_at(batches, step)
+        assert np.isin(rows, data.frame_rows(batches.store, batches.episode_ids)).all()
+        episodes.append(sorted(batches.episode_ids))
+        return rows
+
+    monkeypatch.setattr(data.Batches, "rows_at", noting)
+    return episodes
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("partition", ["task", "lab"])
+def test_no_arm_trains_on_a_held_out_episode_and_all_make_the_same_new_attempts(partition, handed_out):
+    """What training was handed, for each kind of arm; the recording is the one of tests/test_labs.py."""
+    settings = {"tasks": "lift,push", "num_labs": 3, "episodes_per_task": 6, "num_clients": 2, "num_server_rounds": 1}
+    config = experiment.with_recording(from_profile("tiny", **experiment.QUIET, **settings, partition=partition))
+    store, seeds = clients.open_frames(config), [2_000_000, 2_000_001]
+    held_out, shares = clients.held_out_episodes(store, config), clients.shares(store, config)
+    own = sorted(sorted(share.train_ids) for share in shares)
+    whole = sorted(store.episodes.episode_id[~store.episodes.episode_id.isin(held_out)])
+    shown = {demonstration_seed(0, i, attempt) for i in range(len(store.episodes)) for attempt in range(MAX_ATTEMPTS)}
+    for kind, expected in {"federated": own, "local-only": own, "centralized": [whole]}.items():
+        handed_out.clear()
+        found = experiment.MEASURES[kind](config, seeds)
+        trained = sorted(map(list, set(map(tuple, handed_out))))
+        assert trained == expected, kind
+        assert not {episode for part in trained for episode in part} & set(held_out), kind
+        assert sorted(row["episode_id"] for row in found.episodes) == sorted(held_out) and held_out, kind
+        attempts = sorted((row["task"], row["seed"]) for row in found.rows)
+        assert attempts == [(task, seed) for task in ("lift", "push") for seed in seeds], kind
+        assert not {seed for _, seed in attempts} & shown, kind
 
 
 @pytest.mark.integration
@@ -176,7 +229,7 @@ def test_differences_use_the_seeds_that_both_arms_have_and_are_corrected_togethe
     rng = np.random.default_rng(0)
     lines = [
         {"partition": partition, "arm": arm, "run": run, "task": "lift", "seed": seed, "loss": 0.1 * rate + 0.01 * run,
-         "success": rng.random() < rate}
+         "action_error": 10 * (1 - rate), "success": rng.random() < rate}
         for partition in ("iid", "task") for arm, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
         for seed in range(40) if not (arm == "shared" and run == 3)
     ]  # fmt: skip
@@ -185,3 +238,6 @@ def test_differences_use_the_seeds_that_both_arms_have_and_are_corrected_togethe
     assert (found.high < 0).all() and (found.p_holm >= found.p_value).all()
     assert found.loss.tolist() == pytest.approx([-0.04, -0.04])
     assert (found.loss_low <= found.loss).all() and (found.loss <= found.loss_high).all()
+    assert found.action_error.tolist() == found.action_error_high.tolist() == pytest.approx([4, 4])
+    effect, rare = found.columns.get_loc("high"), found.columns.get_loc("p_value")
+    assert effect < rare and list(found.columns[-3:]) == ["p_value", "mcnemar_p", "p_holm"]

@@ -3,12 +3,13 @@
 import json
 import re
 import tomllib
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from fedvla_lib import arms, experiment, run_folder
-from fedvla_lib.config import code_digest
+from fedvla_lib.config import Config, code_digest
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
@@ -56,6 +57,33 @@ def test_each_stored_cell_is_one_that_its_file_asks_for():
             asked = {cell.name for cell in experiment.read_plan(file).cells}
             stored = {cell.name for cell in CELLS if cell.parent.name == file.stem}
             assert stored <= asked, f"{file.name}: {sorted(stored - asked)}"
+
+
+def acting(settings):
+    """The settings, without one whose default changed and that acts in one strategy alone."""
+    return {k: v for k, v in settings.items() if k != "server_momentum" or settings["strategy"] == "fedavgm"}
+
+
+def test_each_stored_cell_was_run_with_the_settings_that_its_file_plans():
+    """Settings that came after a cell was run have no place in its file; the plan has to leave them at the default."""
+    default = asdict(Config())
+    for file in sorted(REFERENCE.glob("*.toml")):
+        if file.name == "notes.toml":
+            continue
+        plan = experiment.read_plan(file)
+        planned = {cell.name: cell for cell in plan.cells}
+        for folder in (cell for cell in CELLS if cell.parent.name == file.stem):
+            cell, stamp = planned[folder.name], run_folder.read_stamp(folder)
+            stored, asked = json.loads((folder / "config.json").read_text()), asdict(cell.config)
+            assert acting(stored) == acting({name: asked[name] for name in stored}), folder
+            assert all(asked[name] == default[name] for name in asked.keys() - stored.keys()), folder
+            assert [stamp[key] for key in ("arm", "kind", "partition", "seed")] == [
+                cell.arm, cell.kind, cell.partition, cell.seed,
+            ], folder  # fmt: skip
+            attempts = run_folder.read_metrics(folder, "rollout")
+            last = attempts[attempts["round"] == attempts["round"].max()]
+            if cell.kind != "clients":  # each of those has seeds of its own
+                assert set(last.seed) == set(plan.rollout_seeds), folder
 
 
 def test_results_of_other_code_carry_a_note():

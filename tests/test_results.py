@@ -58,6 +58,24 @@ def test_without_a_clear_pair_the_tables_are_empty():
     assert np.isnan(results.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
 
 
+def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
+    cells = [("task", "start", "base"), ("task", "pooled", "centralized"), ("task", "shared", "federated"),
+             ("iid", "shared", "federated"), ("uneven", "shared", "federated"), ("uneven", "start", "base"),
+             ("lab", "pooled", "centralized"), ("lab", "shared", "federated")]  # fmt: skip
+    table = pd.DataFrame([
+        {"partition": partition, "arm": arm, "kind": kind, "run": run, "seed": seed, "success": place > 3}
+        for place, (partition, arm, kind) in enumerate(cells) for run in (0, 1) for seed in (7, 8)
+    ])  # fmt: skip
+    found = results.lend(table, ["task", "iid", "uneven", "not yet run"])
+    pd.testing.assert_frame_equal(found[: len(table)], table)
+    lent = found[len(table) :]
+    assert set(zip(lent.partition, lent.arm, strict=True)) == {
+        ("iid", "start"), ("iid", "pooled"), ("uneven", "pooled"),
+    }  # fmt: skip
+    assert not lent.success.any() and len(lent) == 3 * 4  # those of partition task, not of another recording
+    assert not found.duplicated(["partition", "arm", "run", "seed"]).any()
+
+
 def test_a_folder_without_federated_cells_is_named(tmp_path):
     known = {"arm": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1, "samples": 1,
              "bytes": 0, "train_s": None}  # fmt: skip
