@@ -3,6 +3,7 @@
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
+# make check-zip   every chapter as a reader of the zip runs it
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -10,7 +11,7 @@
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
 # share the test files; every one computes on one thread and takes 2 GB).
 .DEFAULT_GOAL := help
-.PHONY: help env book check-site data doctor test lint lab lock new-chapter zip pdf clean
+.PHONY: help env book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -48,7 +49,7 @@ export MUJOCO_GL ?= egl
 endif
 
 help:
-	@sed -n '1,10s/^# \{0,1\}//p' Makefile
+	@sed -n '1,11s/^# \{0,1\}//p' Makefile
 
 env: $(STAMP)
 
@@ -92,6 +93,10 @@ check-site: $(STAMP)
 # What is attached to a release.
 zip: $(STAMP)
 	$(BIN)/python book/make_zip.py
+
+# Every chapter from that zip, at the profile tiny: an empty folder, and the wheel in place of the source.
+check-zip: $(STAMP)
+	$(BIN)/python book/check_zip.py
 
 # Needs the executed chapters of `make book`, and the system's Chromium.
 pdf: $(STAMP)
