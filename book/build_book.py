@@ -21,8 +21,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import library
 import nbformat
 import papermill
+import status
 import yaml
 from papermill.exceptions import PapermillExecutionError
 
@@ -30,10 +32,15 @@ from fedvla_lib import results
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
-RUN_TIMES = "book/run_times.md"  # the page that ends with the table of measured times
+STATUS_PAGE = "book/run_times.md"
+STATUS = b"<!-- status -->"  # there: what this build is made of takes this line's place
 MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
 FRONT_PAGE = "book/index.md"
 HEADLINE = b"<!-- headline -->"  # on the front page: what the comparison found takes this line's place
+ARCHITECTURE, MODULES, IMPORTS = "book/architecture.md", b"<!-- modules -->", "book/_static/imports.svg"
+FUNCTIONS_PAGE, FUNCTIONS = "book/library.md", b"<!-- functions -->"
+FILM = b"<!-- film -->"  # on the front page: the federated policy in this build
+FILMED_IN = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
 TOLD_BY = {"fedavg-200x2x2": "the federated model", "centralized": "training on all demonstrations in one place",
            "local-only": "a lab on its own"}  # fmt: skip
@@ -141,8 +148,9 @@ def execute(notebook: Path, folder: Path, profile: str, library: str) -> Chapter
     target, key = folder / notebook.name, notebook_key(notebook, library)
     parameters = {"profile": profile}
     check_parameters(notebook, parameters)
+    where = status.environment(notebook, profile)
     seconds = _execute(notebook, target, parameters)
-    _finish(target, key, profile, seconds)
+    _finish(target, {"key": key, "profile": profile, "seconds": round(seconds, 1), "environment": where})
     return Chapter(notebook.stem, target, key, seconds, reused=False)
 
 
@@ -176,14 +184,14 @@ def _unfinished(target: Path) -> Path:
     return target.with_name(f"{target.stem}.unfinished.ipynb")
 
 
-def _finish(target: Path, key: str, profile: str, seconds: float) -> None:
+def _finish(target: Path, stamp: dict[str, object]) -> None:
     """Turn papermill's output into the copy that is rendered, without its injected cell and this machine's paths."""
     notebook = nbformat.read(_unfinished(target), as_version=4)
     notebook.cells = [cell for cell in notebook.cells if "injected-parameters" not in cell.metadata.get("tags", [])]
     notebook.metadata.pop("papermill", None)
     for cell in notebook.cells:
         cell.metadata.pop("papermill", None)
-    notebook.metadata["fedvla"] = {"key": key, "profile": profile, "seconds": round(seconds, 1)}
+    notebook.metadata["fedvla"] = stamp
     nbformat.write(notebook, _unfinished(target))
     os.replace(_unfinished(target), target)
 
@@ -231,12 +239,13 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     pages = [path for path in (root / "book").rglob("*") if path.suffix in PAGE_SUFFIXES]
     wanted |= {path.relative_to(root): path.read_bytes() for path in pages}
     wanted |= {Path("notebooks") / chapter.executed.name: chapter.executed.read_bytes() for chapter in chapters}
-    if Path(RUN_TIMES) in wanted:
-        wanted[Path(RUN_TIMES)] += _times_table(chapters, profile).encode()
+    executed = {chapter.name: chapter.executed for chapter in chapters}
+    _put(wanted, STATUS_PAGE, STATUS, lambda: status.status(root, executed.values(), profile))
+    _put(wanted, FRONT_PAGE, FILM, lambda: _film(executed[FILMED_IN], profile))
+    _put(wanted, FRONT_PAGE, HEADLINE, lambda: _headline(root / COMPARISON))
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
-    if HEADLINE in wanted.get(Path(FRONT_PAGE), b""):
-        wanted[Path(FRONT_PAGE)] = wanted[Path(FRONT_PAGE)].replace(HEADLINE, _headline(root / COMPARISON).encode())
+    wanted |= _library_pages(root, wanted, executed.values())
     for page, names in RESULTS_ON.items():
         if Path(page) in wanted:
             wanted[Path(page)] += _benchmark_tables([root / BENCHMARKS / f"{name}.json" for name in names]).encode()
@@ -246,6 +255,22 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         path.unlink()
     parts = [path.as_posix().encode() + b"\0" + content for path, content in sorted(wanted.items())]
     return _digest([Path(__file__).read_bytes(), *parts])
+
+
+def _put(wanted: dict[Path, bytes], page: str, mark: bytes, text: Callable[[], str]) -> None:
+    """Put generated text in the place of a page's mark, if the page has it."""
+    if mark in wanted.get(Path(page), b""):
+        wanted[Path(page)] = wanted[Path(page)].replace(mark, text().encode())
+
+
+def _library_pages(root: Path, wanted: dict[Path, bytes], chapters: Iterable[Path]) -> dict[Path, bytes]:
+    """Fill the pages about the library and return the picture of its imports."""
+    if Path(ARCHITECTURE) not in wanted:
+        return {}
+    trees, used = library.modules(root), library.used_in(chapters)
+    _put(wanted, ARCHITECTURE, MODULES, lambda: library.table(root, used))
+    _put(wanted, FUNCTIONS_PAGE, FUNCTIONS, lambda: library.reference(trees))
+    return {Path(IMPORTS): library.picture(library.imports(trees)).encode()}
 
 
 def _rendering_config(root: Path) -> bytes:
@@ -266,11 +291,18 @@ def _write_if_changed(path: Path, content: bytes) -> None:
     os.replace(unfinished, path)
 
 
-def _times_table(chapters: list[Chapter], profile: str) -> str:
-    rows = [f"| [](../notebooks/{chapter.executed.name}) | {chapter.seconds:.0f} |" for chapter in chapters]
-    total = sum(chapter.seconds for chapter in chapters)
-    head = f"\nProfile `{profile}`, {os.cpu_count()} cores.\n\n| chapter | seconds |\n|---|---:|\n"
-    return head + "\n".join([*rows, f"| **together** | **{total:.0f}** |"]) + "\n"
+def _film(chapter: Path, profile: str) -> str:
+    """The federated policy's first attempt of the last evaluated round, as a chapter shows it, whatever came of it."""
+    outputs = [output for cell in nbformat.read(chapter, as_version=4).cells for output in cell.get("outputs", [])]
+    pages = [output.get("data", {}).get("text/html", "") for output in outputs]
+    films = [film for page in pages for film in re.findall(r"<figure.*?</figure>", page, flags=re.DOTALL)]
+    by_round = {film: int(told[1]) for film in films if (told := re.search(r'aria-label="Round (\d+)\.', film))}
+    if not by_round:
+        raise BookError(f"{chapter.name} shows no film of a round, which the front page needs")
+    return (
+        f"{max(by_round, key=by_round.get)}\n\nThe federated policy in this build, profile `{profile}`: overhead "
+        "camera left, front camera right. {doc}`/notebooks/05_evaluation_videos` shows the others, failures included."
+    )
 
 
 def _headline(comparison: Path) -> str:
@@ -366,7 +398,8 @@ def render(source: Path, output: Path) -> Path:
     # In a process of its own: Sphinx patches docutils globally and changes sys.path.
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
     options = ["-W", "-n", "--keep-going", "--quiet"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where site_scripts.py lies
+    # Where site_scripts.py lies, and the library whose functions are described.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT)])}
     # Warnings are on stderr.
     built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
     if built.returncode:

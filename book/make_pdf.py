@@ -47,7 +47,8 @@ def executed_chapters(root: Path, profile: str) -> list[Chapter]:
 def render_single(source: Path, output: Path) -> Path:
     """Render a laid out book as a single page and return it; `make book` is where warnings are errors."""
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where site_scripts.py lies
+    # Where site_scripts.py lies, and the library whose functions are described.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT)])}
     done = subprocess.run(
         [*command, "--builder", "singlehtml", "--quiet"], env=environment, capture_output=True, text=True, check=False
     )

@@ -1,11 +1,13 @@
 """A Sphinx extension: no script that would fetch code from elsewhere, or twice, ends up on a page.
 
-It also mends what a screen reader is told of the bibliography, and lets a single page hold the whole book, to be
-printed.
+It also mends what a screen reader is told of the bibliography, links the library's functions to the chapters that use
+them, and lets a single page hold the whole book, to be printed.
 """
 
+from pathlib import Path
 from typing import Any
 
+import library
 from sphinx.application import Sphinx
 
 UNUSED = "thebe"  # Jupyter Book loads it always, and declares its constants twice
@@ -27,6 +29,21 @@ def with_list_items(app: Sphinx, page: str, template: str, context: dict[str, An
         context["body"] = context["body"].replace('role="doc-biblioentry"', 'role="listitem"')
 
 
+def link_to_chapters(app: Sphinx) -> None:
+    """End the description of every function with links to the chapters that use it."""
+    if "autodoc-process-docstring" not in app.events.events:
+        return  # a book without a page about the library
+    used = library.used_in(sorted((Path(app.srcdir) / "notebooks").glob("*.ipynb")))
+
+    def add(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+        if what == "module" and "" in lines:
+            del lines[lines.index("") :]  # the sentence that says what it is for
+        elif name in used:
+            lines += ["", "In the book: " + ", ".join(f":doc:`/notebooks/{chapter}`" for chapter in used[name]) + "."]
+
+    app.connect("autodoc-process-docstring", add, priority=900)  # behind napoleon, which rewrites the sections
+
+
 def complete_single_page(app: Sphinx) -> None:
     """Let the single page show all that pages show.
 
@@ -46,4 +63,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("html-page-context", without_unused, priority=900)
     app.connect("html-page-context", with_list_items)
     app.connect("builder-inited", complete_single_page)
+    app.connect("builder-inited", link_to_chapters)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

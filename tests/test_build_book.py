@@ -36,7 +36,9 @@ def project(tmp_path) -> Path:
     (tmp_path / "_config.yml").write_text("title: A book\nexecute: {execute_notebooks: force}\n")
     (tmp_path / "book").mkdir()
     (tmp_path / "book" / "index.md").write_text("# Front\n")
-    (tmp_path / "book" / "run_times.md").write_text("# Run times\n")
+    (tmp_path / "book" / "run_times.md").write_text("# Run times\n\n<!-- status -->\n")
+    (tmp_path / "book" / "reference").mkdir()
+    (tmp_path / "book" / "reference" / "notes.toml").write_text("[code]\n")
     write_notebook(tmp_path / "notebooks" / "one.ipynb")
     return tmp_path
 
@@ -154,7 +156,7 @@ def test_lay_out_touches_only_what_changed(project):
     assert build_book.lay_out(project, source, [chapter], "tiny") == digest
     times = {path: path.stat().st_mtime_ns for path in source.rglob("*") if path.is_file()}
     assert "execute_notebooks: 'off'" in (source / "_config.yml").read_text()
-    assert "| 12 |" in (source / "book" / "run_times.md").read_text()
+    assert "[](../notebooks/one.ipynb)" in (source / "book" / "run_times.md").read_text()
     (source / "old.md").write_text("a page of an earlier build")
     (project / "book" / "index.md").write_text("# New front\n")
     assert build_book.lay_out(project, source, [chapter], "tiny") != digest
@@ -206,6 +208,24 @@ def test_warnings_of_the_book_are_errors(project, capfd):
     with pytest.raises(BookError, match="built strictly"):
         build_book.render(source, project / "_build" / "tiny")
     assert "nowhere" in capfd.readouterr().err
+
+
+def film(number: int, ending: str) -> str:
+    return f'<figure><video aria-label="Round {number}. Lift the red cube. {ending}"></video></figure>'
+
+
+@pytest.mark.unit
+def test_the_front_page_shows_the_first_film_of_the_last_round(tmp_path):
+    html = "".join([film(0, "no"), film(10, "failed"), film(0, "no"), film(10, "worked")])
+    output = nbformat.v4.new_output("display_data", {"text/html": f"<div>{html}</div>"})
+    cell = nbformat.v4.new_code_cell("show", outputs=[output])
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "films.ipynb")
+    said = build_book._film(tmp_path / "films.ipynb", "tiny")
+    assert said.startswith(film(10, "failed") + "\n\n") and "profile `tiny`" in said
+    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "films.ipynb")
+    with pytest.raises(BookError, match="films.ipynb shows no film"):
+        build_book._film(tmp_path / "films.ipynb", "tiny")
+    assert build_book.FILM in (ROOT / build_book.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
