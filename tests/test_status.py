@@ -23,7 +23,8 @@ def chapter(folder: Path, name: str, **stamp) -> Path:
 
 def test_chapters_are_listed_with_their_place(tmp_path):
     notebook = nbformat.v4.new_code_cell('profile = "tiny"\nseed = 7', metadata={"tags": ["parameters"]})
-    nbformat.write(nbformat.v4.new_notebook(cells=[notebook]), tmp_path / "source.ipynb")
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+    nbformat.write(nbformat.v4.new_notebook(cells=[notebook], metadata=kernel), tmp_path / "source.ipynb")
     where = status.environment(tmp_path / "source.ipynb", "tiny")
     one = chapter(tmp_path, "01_data", seconds=12.4, environment=where)
     two = chapter(tmp_path, "02_partitioning", seconds=3.0)  # of a build that kept no place
