@@ -1,13 +1,14 @@
 """A Sphinx extension: no script that would fetch code from elsewhere, or twice, ends up on a page.
 
-It also mends what a screen reader is told of the bibliography, links the library's functions to the chapters that use
-them, and lets a single page hold the whole book, to be printed.
+It also numbers equations, mends what a screen reader is told of the bibliography, links the library's functions to the
+chapters that use them, and lets a single page hold the whole book, to be printed.
 """
 
 from pathlib import Path
 from typing import Any
 
 import library
+from docutils import nodes
 from sphinx.application import Sphinx
 
 UNUSED = "thebe"  # Jupyter Book loads it always, and declares its constants twice
@@ -27,6 +28,16 @@ def with_list_items(app: Sphinx, page: str, template: str, context: dict[str, An
     """
     if "body" in context:  # the index and the search have none
         context["body"] = context["body"].replace('role="doc-biblioentry"', 'role="listitem"')
+
+
+def number_equations(app: Sphinx, doctree: nodes.document) -> None:
+    """Give displayed equations a number and an anchor, without labels in notebooks, where they would be read."""
+    domain = app.env.get_domain("math")
+    for count, equation in enumerate(doctree.findall(nodes.math_block), 1):
+        equation["label"] = f"{app.env.docname}:{count}"
+        domain.note_equation(app.env.docname, equation["label"], location=equation)
+        equation["number"] = domain.get_equation_number_for(equation["label"])
+        equation["ids"].append(f"equation-{count}")
 
 
 def link_to_chapters(app: Sphinx) -> None:
@@ -60,6 +71,7 @@ def _text(file: Any) -> str:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect to Sphinx, behind those who add scripts and nodes."""
+    app.connect("doctree-read", number_equations)
     app.connect("html-page-context", without_unused, priority=900)
     app.connect("html-page-context", with_list_items)
     app.connect("builder-inited", complete_single_page)

@@ -57,15 +57,16 @@ def test_uses_are_found_by_name_and_through_the_module(tmp_path):
 
 
 @pytest.mark.integration
-def test_a_described_function_links_to_its_chapter(tmp_path):
+def test_a_described_function_links_to_its_chapter_and_equations_have_numbers(tmp_path):
     """With the settings of the book, strictly; a small module, so that nothing heavy is imported."""
     (tmp_path / "notebooks").mkdir()
     notebook(tmp_path / "notebooks", "one", "from fedvla_lib.player import video_figure")
     tree = {"player": library.modules(ROOT)["player"]}
-    (tmp_path / "index.md").write_text(f"# Functions\n\n{library.reference(tree)}")
+    (tmp_path / "index.md").write_text(f"# Functions\n\n$$ a = 1 $$\n\n$$\nb = 2\n$$\n\n{library.reference(tree)}")
     (tmp_path / "notebooks" / "one.md").write_text("---\norphan: true\n---\n# The chapter\n")
     (tmp_path / "conf.py").write_text(
         "extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'site_scripts']\n"
+        "myst_enable_extensions = ['dollarmath']\nnumfig = True\n"
         "exclude_patterns = ['*/*.ipynb']\nnitpick_ignore_regex = [['py:.*', '.*']]\n"
     )
     environment = {"PYTHONPATH": f"{ROOT / 'book'}:{ROOT}", "PATH": str(Path(sys.executable).parent)}
@@ -73,9 +74,12 @@ def test_a_described_function_links_to_its_chapter(tmp_path):
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "html" / "index.html").read_text()
+    assert re.findall(r'class="eqno">\(([^<]*)\)<a class="headerlink" href="(#[^"]*)"', page) == [
+        ("1", "#equation-1"), ("2", "#equation-2")
+    ]  # fmt: skip
     described = page[page.index('id="fedvla_lib.player.video_figure"') :]
     assert re.search(r'In the book: <a class="reference internal" href="notebooks/one.html"', described)
-    assert "has no frames that can be read" in described
+    assert "no frames that can be read" in described
 
 
 @pytest.mark.unit
