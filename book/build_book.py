@@ -348,9 +348,10 @@ def _card_tables(account: dict) -> str:
         "seed": str(recipe["seed"]),
         "made": f"{stamp['started'][:10]}, torch {stamp['versions']['torch']}, lerobot {stamp['versions']['lerobot']}",
     }
-    made = _table(["what", "measured"], [[name, value] for name, value in facts.items()])
-    success = _table(["task", "successes", "rate", "95 % interval"], [_rate(row, "task") for row in account["success"]])
-    told = _table(
+    made = status.table(["what", "measured"], [[name, value] for name, value in facts.items()])
+    rates = [_rate(row, "task") for row in account["success"]]
+    success = status.table(["task", "successes", "rate", "95 % interval"], rates)
+    told = status.table(
         ["task", "told", "successes", "rate", "95 % interval"],
         [[row["task"], TOLD[row["told"]], *_rate(row, "task")[1:]] for row in account["language"]],
     )
@@ -371,7 +372,7 @@ def _benchmark_tables(files: list[Path]) -> str:
         rows = [[_number(value) for value in row.values()] for row in result["rows"]]
         title = TITLES.get(path.stem, path.stem.replace("_", " "))
         where = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
-        parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{_table(list(result['rows'][0]), rows)}")
+        parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{status.table(list(result['rows'][0]), rows)}")
     return "\n".join(parts)
 
 
@@ -386,11 +387,6 @@ def _number(value: object) -> str:
 def _rate(row: dict, name: str) -> list[str]:
     interval = f"{row['low']:.0%} to {row['high']:.0%}"
     return [row[name], f"{row['successes']} of {row['n']}", f"{row['success_rate']:.0%}", interval]
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def render(source: Path, output: Path) -> Path:

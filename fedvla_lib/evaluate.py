@@ -46,7 +46,7 @@ def evaluate(
     action_smoothness (mean absolute second difference of the joint targets, degrees per step squared; lower is
     smoother) and video (path or None). With `videos_dir`, a rollout leaves ``rollout_<timestamp>_<task>_<seed>.mp4``
     and a trajectory beside it; with `films`, only the first so many of each task do. Of a rollout that is not filmed
-    nothing is drawn but what the actor looks at, which is several times faster and has the same result.
+    nothing is drawn but what the actor looks at, which is faster and has the same result.
     """
     filmed = set(seeds[:films] if videos_dir else ())
     rows = []
