@@ -557,7 +557,11 @@ def _require_positive(flag: str, value: int) -> None:
 
 
 def _print_table(table: Any) -> None:
-    print(table.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
+    from fedvla_lib.compare import p_text
+    from fedvla_lib.results import P_VALUES
+
+    rare = dict.fromkeys(P_VALUES, p_text)
+    print(table.to_string(index=False, float_format=lambda value: f"{value:.3f}", formatters=rare))
 
 
 def _one_line(error: BaseException) -> str:

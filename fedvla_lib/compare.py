@@ -13,6 +13,7 @@ from statsmodels.stats.proportion import proportion_confint
 
 CONFIDENCE = 0.95
 POWER = 0.8
+SMALLEST_P = 0.001  # smaller ones are printed as being below
 DISTINCT = 8  # different values that a bootstrap of a mean needs
 
 
@@ -143,6 +144,15 @@ def smallest_difference(n: int, discordant: float, confidence: float = CONFIDENC
 def holm(p_values: Sequence[float]) -> np.ndarray:
     """Return p-values corrected for being several (Holm 1979)."""
     return multipletests(p_values, method="holm")[1]
+
+
+def p_text(value: float, equals: str = "") -> str:
+    """Return a p-value as the book prints it: three digits, and "< 0.001" below, since no p-value is zero.
+
+    Args:
+        equals: stands before a value that is printed; "= " makes the end of a sentence.
+    """
+    return f"< {SMALLEST_P:g}" if value < SMALLEST_P else f"{equals}{value:.3f}"
 
 
 def mean_interval(

@@ -126,6 +126,15 @@ def test_holm_by_hand():
     assert compare.holm([0.01, 0.04, 0.03]).tolist() == pytest.approx([0.03, 0.06, 0.06])
 
 
+@pytest.mark.parametrize(("value", "text"), [(1.0, "1.000"), (0.0123, "0.012"), (0.001, "0.001")])
+def test_a_p_value_has_three_digits(value, text):
+    assert compare.p_text(value) == text and compare.p_text(value, "= ") == f"= {text}"
+
+
+def test_a_p_value_is_never_printed_as_zero():
+    assert compare.p_text(0.0009) == compare.p_text(3e-9) == compare.p_text(3e-9, "= ") == "< 0.001"
+
+
 def test_the_smallest_visible_difference_is_seen_about_four_times_in_five():
     """Pairs drawn with just that difference are found significant with the power that was asked for."""
     n, discordant = 200, 0.3
