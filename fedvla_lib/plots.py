@@ -576,6 +576,33 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw differences in success of one arm to others, a panel for each other arm, a row for each partition.
+
+    Each panel has its own scale: what separates an arm from its rival is small beside what separates it from a bad one.
+
+    Args:
+        table: columns partition, arm, other, difference, low, high; the same arm in all lines.
+    """
+    others, partitions = list(dict.fromkeys(table.other)), list(dict.fromkeys(table.partition))
+    if axes is None:
+        size = (WIDTH, 1.6 + 0.35 * len(partitions))
+        _, axes = plt.subplots(1, len(others), figsize=size, sharey=True, squeeze=False, layout="constrained")
+        axes = axes[0]
+    for ax, other in zip(axes, others, strict=True):
+        part = table[table.other == other]
+        rows = [partitions.index(name) for name in part.partition]
+        errors = 100 * np.abs(np.stack([part.difference - part.low, part.high - part.difference]))
+        ax.errorbar(100 * part.difference, rows, xerr=errors, fmt="o", capsize=4, color=arm_color(other))
+        ax.axvline(0, color="#555555", linewidth=1)
+        ax.set_title(f"{table.arm.iloc[0]}\n− {other}", fontsize=10)
+        ax.set_xlabel("difference [points],\n95 % interval")
+    axes[0].set_yticks(range(len(partitions)), partitions)
+    axes[0].set_ylim(len(partitions) - 0.5, -0.5)
+    axes[0].set_ylabel("partition")
+    return axes
+
+
 def run_differences(table: pd.DataFrame, *, note: str = "") -> Sequence[Axes]:
     """Draw each metric's differences to the first run with their intervals; columns run, against, metric, difference...
 

@@ -12,6 +12,8 @@ from fedvla_lib import compare, run_folder
 
 OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
 OF_RUN = ("partition", "arm", "run")
+# Settings that decide what demonstrations there are and which of them are held out.
+RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
 BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
 HELD_OUT = ("loss", "action_error")
 P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
@@ -45,26 +47,39 @@ def _attempts(cell: Path) -> pd.DataFrame:
     rows = run_folder.read_metrics(cell, "rollout")
     last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
     measured = {name: float(last.get(name, "nan")) for name in HELD_OUT}
-    return rows[rows["round"] == last["round"]].assign(**_known(cell), **measured)
+    config = run_folder.read_config(cell)
+    recording = ", ".join(str(getattr(config, name)) for name in RECORDING)
+    return rows[rows["round"] == last["round"]].assign(**_known(cell), **measured, recording=recording)
 
 
-def lend(rows: pd.DataFrame, partitions: Sequence[str]) -> pd.DataFrame:
-    """Return the rows, and those of arms that see no partition once more for each partition of the recording.
+def lend(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows, and those of arms that see no partition once more for each partition of the same recording.
 
     Base and centralized training come out the same however a recording is dealt out, so they are measured with one of
-    its partitions; to the others they are lent, for the same seeds and attempts.
+    its partitions; to the others they are lent, for the same seeds and attempts. A partition that has an arm itself is
+    lent none of it, and no partition is lent anything of another recording, such as that of several laboratories.
 
     Args:
         rows: of `read_results`.
-        partitions: those of one recording. What has no row, or has an arm itself, is lent nothing.
     """
-    there = rows[rows.partition.isin(partitions)]
     lent = []
-    for _, measured in there[there.kind.isin(BLIND)].groupby("arm", sort=False):
-        lender = measured[measured.partition == measured.partition.iloc[0]]
-        lacking = [name for name in there.partition.unique() if name not in set(measured.partition)]
-        lent += [lender.assign(partition=name) for name in lacking]
+    for _, there in rows.groupby("recording", sort=False):
+        for _, measured in there[there.kind.isin(BLIND)].groupby("arm", sort=False):
+            lender = measured[measured.partition == measured.partition.iloc[0]]
+            lacking = [name for name in there.partition.unique() if name not in set(measured.partition)]
+            lent += [lender.assign(partition=name) for name in lacking]
     return pd.concat([rows, *lent], ignore_index=True)
+
+
+def fill_in(rows: pd.DataFrame, other: pd.DataFrame, arm: str) -> pd.DataFrame:
+    """Return the partitions of `rows` in which `arm` has two training seeds or more, and those that only `other` has.
+
+    Args:
+        rows, other: of `read_results`, perhaps lent; partitions of one name are the same in both.
+    """
+    seeds = rows[rows.arm == arm].groupby("partition").run.nunique()
+    kept = rows[rows.partition.isin(seeds.index[seeds > 1])]
+    return pd.concat([kept, other[~other.partition.isin(kept.partition)]], ignore_index=True)
 
 
 def read_rounds(folder: Path) -> pd.DataFrame:

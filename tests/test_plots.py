@@ -163,6 +163,20 @@ def test_arms_and_their_differences_keep_their_intervals():
     assert labelled(ax) and ax.get_yticklabels()[0].get_text() == "federated − base"
 
 
+def test_differences_have_a_panel_for_each_other_arm_and_a_row_for_each_partition():
+    table = pd.DataFrame(
+        {"partition": ["iid", "task", "task"], "arm": "averaged", "other": ["pooled", "pooled", "alone"],
+         "difference": [-0.02, -0.1, 0.5], "low": [-0.03, -0.2, 0.4], "high": [0.01, -0.05, 0.7]}
+    )  # fmt: skip
+    axes = plots.differences_by_partition(table)
+    assert [ax.get_title() for ax in axes] == ["averaged\n− pooled", "averaged\n− alone"]
+    assert [text.get_text() for text in axes[0].get_yticklabels()] == ["iid", "task"] and labelled(axes[0])
+    np.testing.assert_allclose(axes[0].containers[0].lines[0].get_xydata(), [[-2, 0], [-10, 1]])
+    np.testing.assert_allclose(axes[1].containers[0].lines[0].get_xydata(), [[50, 1]])  # in the row of its partition
+    np.testing.assert_allclose(axes[0].containers[0].lines[2][0].get_segments()[1][:, 0], [-20, -5])
+    assert all(ax.get_xlim()[0] < 0 < ax.get_xlim()[1] for ax in axes)  # zero is in sight
+
+
 def test_model_bars_show_counts_and_what_trains():
     table = pd.DataFrame({"part": ["eye", "hand"], "parameters": [2_000_000, 500_000], "trainable": [0, 500_000]})
     ax = plots.module_bars(table)

@@ -1,6 +1,7 @@
 """Checkpoints of stored runs: how held-out loss ranks them beside success, and which pairs it ranks the wrong way."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,7 @@ import pytest
 from fedvla_lib import results
 
 pytestmark = pytest.mark.unit
+ROOT = Path(__file__).parents[1]
 
 
 def rounds(*lines):
@@ -58,15 +60,23 @@ def test_without_a_clear_pair_the_tables_are_empty():
     assert np.isnan(results.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
 
 
-def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
-    cells = [("task", "start", "base"), ("task", "pooled", "centralized"), ("task", "shared", "federated"),
-             ("iid", "shared", "federated"), ("uneven", "shared", "federated"), ("uneven", "start", "base"),
-             ("lab", "pooled", "centralized"), ("lab", "shared", "federated")]  # fmt: skip
-    table = pd.DataFrame([
-        {"partition": partition, "arm": arm, "kind": kind, "run": run, "seed": seed, "success": place > 3}
-        for place, (partition, arm, kind) in enumerate(cells) for run in (0, 1) for seed in (7, 8)
+def attempts(*cells):
+    """Two attempts of two training seeds for each (partition, arm, kind, recording)."""
+    return pd.DataFrame([
+        {"partition": partition, "arm": arm, "kind": kind, "recording": recording, "run": run, "seed": seed,
+         "success": place > 3}
+        for place, (partition, arm, kind, recording) in enumerate(cells) for run in (0, 1) for seed in (7, 8)
     ])  # fmt: skip
-    found = results.lend(table, ["task", "iid", "uneven", "not yet run"])
+
+
+def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
+    table = attempts(
+        ("task", "start", "base", "one"), ("task", "pooled", "centralized", "one"),
+        ("task", "shared", "federated", "one"), ("iid", "shared", "federated", "one"),
+        ("uneven", "shared", "federated", "one"), ("uneven", "start", "base", "one"),
+        ("lab", "pooled", "centralized", "five"), ("lab", "shared", "federated", "five"),
+    )  # fmt: skip
+    found = results.lend(table)
     pd.testing.assert_frame_equal(found[: len(table)], table)
     lent = found[len(table) :]
     assert set(zip(lent.partition, lent.arm, strict=True)) == {
@@ -74,6 +84,25 @@ def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
     }  # fmt: skip
     assert not lent.success.any() and len(lent) == 3 * 4  # those of partition task, not of another recording
     assert not found.duplicated(["partition", "arm", "run", "seed"]).any()
+
+
+def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_several():
+    stored = results.read_results(ROOT / "book" / "reference" / "comparison")
+    several = stored.partition == "lab"
+    assert several.any() and not set(stored[several].recording) & set(stored[~several].recording)
+    assert stored[~several].recording.nunique() == 1
+    lab = stored[several & (stored.kind != "base")]
+    found = results.lend(pd.concat([stored[~several], lab]))
+    assert not ((found.partition == "lab") & (found.kind == "base")).any()
+
+
+def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
+    here = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "lab")))
+    here = here[(here.partition != "iid") | (here.run == 0)]
+    here.loc[here.partition == "lab", "arm"] = "alone"
+    there = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "uneven"))).assign(run=5)
+    found = results.fill_in(here, there, "shared")
+    assert found.groupby("partition").run.unique().map(list).to_dict() == {"task": [0, 1], "iid": [5], "uneven": [5]}
 
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):
