@@ -230,9 +230,14 @@ def test_the_front_page_shows_the_first_film_of_the_last_round(tmp_path):
 
 @pytest.mark.unit
 def test_the_front_page_says_what_the_stored_comparison_found():
-    rows = results.read_results(ROOT / build_book.COMPARISON)
-    rows = rows[(rows.partition == "task") & (rows.arm == "fedavg-200x2x2")]
+    stored = results.read_results(ROOT / build_book.COMPARISON)
+    rows = stored[(stored.partition == "task") & (stored.arm == "fedavg-200x2x2")]
     said = build_book._headline(ROOT / build_book.COMPARISON)
     assert f"the federated model {100 * rows.success.mean():.1f} % [" in said
     assert f"{len(rows):,} attempts over {rows.run.nunique()} training seeds" in said
+    assert set(stored.partition) <= set(build_book.DEALT)
+    gaps = results.differences(results.lend(stored), [("fedavg-200x2x2", "centralized")], seed=0)
+    for gap in gaps.itertuples():  # every partition that has both
+        words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
+        assert words in said and said.count(" points [") == len(gaps)
     assert build_book.HEADLINE in (ROOT / build_book.FRONT_PAGE).read_bytes()
