@@ -19,7 +19,7 @@ from fedvla_lib.train import local_train
 # Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
 TRAINED_BY = (
     *data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train", "config", "partition", "params",
-    "corrections", "quantise", "lora", "clients", "client_app", "server_app", "strategies", "roster", "wire",
+    "corrections", "quantise", "lora", "clients", "client_app", "server_app", "grid", "strategies", "roster", "wire",
     "evaluate", "engine", "arms",
 )  # fmt: skip
 

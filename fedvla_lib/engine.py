@@ -153,6 +153,7 @@ class InlineGrid(Grid):
     def _handle(self, message: Message) -> str:
         """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""
         key = str(len(self._took_s))
+        message.metadata.__dict__["_message_id"] = key  # a reply names it; Flower's grids set it this way too
         node, began = message.metadata.dst_node_id, time.perf_counter()
         try:
             self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])

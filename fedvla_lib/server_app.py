@@ -14,6 +14,7 @@ from fedvla_lib import checkpoint, clients, data, model, roster, run_folder, str
 from fedvla_lib.checkpoint import Checkpoint
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.evaluate import rollout_seeds, success_rate
+from fedvla_lib.grid import for_simulation
 from fedvla_lib.params import Arrays, load_arrays, shapes_of
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.tasks import check_tasks
@@ -53,7 +54,7 @@ def build(
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(grid, config, run, tools, progress, states)
+            federate(for_simulation(grid), config, run, tools, progress, states)
 
     return app
 

@@ -20,7 +20,7 @@ FENCES = {
     "mink": {"expert"},
     "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections", "lora", "full_size"},
     "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env", "full_size"},
-    "flwr": {"wire", "roster", "strategies", "engine"} | APPS,
+    "flwr": {"wire", "roster", "grid", "strategies", "engine"} | APPS,
     "flwr_datasets": {"partition"},
     "matplotlib": {"plots"},
     "ray": set(),
