@@ -21,6 +21,7 @@ from fedvla_lib.config import PROFILES, Config, Recipe, from_profile, task_names
 from fedvla_lib.spec import CAMERAS, image_key
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
+FAILED = 2  # bad input, or a run that failed
 DOWN = 3  # as service managers report a service that is not running
 DAMAGED = 1  # something was found, and not all of it is sound
 LOCAL = "local"  # who acts and is measured where there is no federation
@@ -46,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.traceback:
             traceback.print_exc()
         print(f"fedvla {options.command}: {_one_line(error)}", file=sys.stderr)
-        return 2
+        return FAILED
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -142,7 +143,8 @@ def _add_deploy(commands: Any) -> None:
 def _add_superlink(commands: Any) -> None:
     text = "start, stop or look at the SuperLink that flwr run . local-simulation talks to"
     parser = _command(commands, "superlink", standing_superlink, text, "nothing was started")
-    parser.add_argument("action", choices=("up", "down", "status"), help="status exits with 3 if it is down")
+    text = "status exits with 3 if it is down; last says how the newest run ended, and exits with 2 if it failed"
+    parser.add_argument("action", choices=("up", "down", "status", "last"), help=text)
 
 
 def _add_credentials(commands: Any) -> None:
@@ -392,17 +394,18 @@ def deploy(options: argparse.Namespace) -> None:
 
 
 def standing_superlink(options: argparse.Namespace) -> int:
-    """Start or stop the SuperLink of the project's connection file, or say whether it is up."""
+    """Start or stop the SuperLink of the connection file, or say whether it is up, or how its last run ended."""
     from fedvla_lib import standing
 
     if not os.environ.get("FLWR_HOME"):
         raise ValueError("FLWR_HOME is not set: `. flower/env.sh` first, so that Flower settings of your own stay")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was started is stopped here too
     home = Path(os.environ["FLWR_HOME"])
-    if options.action == "status":
-        is_up, words = standing.status(home)
+    if options.action in ("status", "last"):
+        asked, otherwise = {"status": (standing.status, DOWN), "last": (standing.last, FAILED)}[options.action]
+        is_well, words = asked(home)
         print(words)
-        return 0 if is_up else DOWN
+        return 0 if is_well else otherwise
     print({"up": standing.up, "down": standing.down}[options.action](home))
     return 0
 

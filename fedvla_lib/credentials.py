@@ -20,6 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 PEM, PKCS8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
 NO_PASSWORD = serialization.NoEncryption()
 DAYS = 7
+OWN_HOSTS = ("localhost", "127.0.0.1")  # under which a server reaches itself
 CLOCK_SKEW = timedelta(minutes=5)  # between machines that are to trust each other
 
 
@@ -40,19 +41,19 @@ class NodeKey:
     public: Path
 
 
-def make_server(
-    folder: Path, hosts: Sequence[str] = ("localhost", "127.0.0.1"), *, until: datetime | None = None
-) -> ServerFiles:
+def make_server(folder: Path, hosts: Sequence[str] = (), *, until: datetime | None = None) -> ServerFiles:
     """Make an authority and a server certificate signed by it; the authority's own key is not kept.
 
     Args:
         folder: where the files go.
-        hosts: names and addresses under which nodes reach the server.
+        hosts: names and addresses under which nodes on other machines reach the server. Its own are added: a SuperLink
+            that listens on all addresses starts a helper there, which calls it on this one and checks who answers.
         until: end of validity, with a time zone; default a week from now. One in the past makes an expired certificate.
     """
     until = until or datetime.now(UTC) + timedelta(days=DAYS)
     authority_key, server_key = ec.generate_private_key(ec.SECP384R1()), ec.generate_private_key(ec.SECP384R1())
     authority_name = _name("federation authority")
+    names = [_host(host) for host in dict.fromkeys([*hosts, *OWN_HOSTS])]
     authority = (
         _certificate(authority_name, authority_name, authority_key, until)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -62,7 +63,7 @@ def make_server(
     )
     server = (
         _certificate(_name("federation server"), authority_name, server_key, until)
-        .add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()), critical=False)

@@ -15,6 +15,7 @@ from fedvla_lib import superlink
 from fedvla_lib.run_folder import write_atomically, write_json
 
 CONNECTIONS = Path(__file__).resolve().parent / "connections.toml"
+NAME = "local-simulation"
 SECTION = re.compile(r"^(?=\[superlink\.)", re.MULTILINE)  # where the table of a connection begins
 
 
@@ -87,6 +88,22 @@ def status(home: Path) -> tuple[bool, str]:
     return bool(process), f"{_where()} is {'up, process ' + str(process.pid) if process else 'not up'}"
 
 
+def last(home: Path) -> tuple[bool, str]:
+    """Return whether the newest run on the SuperLink completed, and words for it: `flwr run` exits with 0 either way.
+
+    Raises:
+        FlowerRunError: Flower does not answer.
+        ValueError: the SuperLink is not up, or has had no run yet.
+    """
+    if not _running(home):
+        raise ValueError(f"{_where()} is not up, and what it knew of runs ended with it")
+    link = superlink.SuperLink(superlink.flower_environment(home), home / "superlink.log", connection=NAME)
+    if not (runs := link.ask("list", NAME, "--limit", "1").get("runs")):
+        raise ValueError(f"{_where()} has had no run yet: flwr run . {NAME} --stream")
+    ended, details = superlink.last_status(link, runs[0]["run-id"])
+    return ended == superlink.COMPLETED, f"run {runs[0]['run-id']} is {ended} ({details})"
+
+
 def _running(home: Path) -> psutil.Process | None:
     """Return the process that `up` started, if it lives: the same number may belong to another one by now."""
     file = home / "superlink.json"
@@ -99,4 +116,4 @@ def _running(home: Path) -> psutil.Process | None:
 
 
 def _where() -> str:
-    return tomllib.loads(CONNECTIONS.read_text())["superlink"]["local-simulation"]["address"]
+    return tomllib.loads(CONNECTIONS.read_text())["superlink"][NAME]["address"]

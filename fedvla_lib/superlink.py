@@ -33,6 +33,7 @@ from fedvla_lib.credentials import ServerFiles
 
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
 STATUS_TRIES, POLL_S = 6, 5.0
+COMPLETED = "finished:completed"
 RUNTIME_TRIES = 3  # Ray's 15 s are fixed in its code; a busy machine misses them, seldom twice
 NOT_STARTED = "Simulation Runtime crashed"  # what Flower says if Ray did not come up, before any client was asked
 FIRST_ERROR = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
@@ -58,6 +59,7 @@ class SuperLink:
     log: Path  # what the run printed
     port: int = 0
     files: ServerFiles | None = None  # of a SuperLink with TLS
+    connection: str = CONNECTION  # its name in Flower's file of them
 
     def submit(self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None) -> str:
         """Start a run of the app, follow its log until the run ends, and return its id.
@@ -68,7 +70,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the run was not accepted, or did not end in time.
         """
-        command = [program("flwr"), "run", str(app), CONNECTION, *options, "--stream"]
+        command = [program("flwr"), "run", str(app), self.connection, *options, "--stream"]
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
@@ -84,7 +86,7 @@ class SuperLink:
 
     def status(self, run_id: str) -> tuple[str, str]:
         """Return a run's status, such as ``running`` or ``finished:completed``, and its details."""
-        answer = self.ask("list", CONNECTION, "--run-id", run_id)
+        answer = self.ask("list", self.connection, "--run-id", run_id)
         if not answer.get("runs"):
             raise FlowerRunError(f"flwr list knows no run {run_id}")
         return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
@@ -250,13 +252,19 @@ def require_completed(link: SuperLink, run_id: str) -> None:
     Raises:
         FlowerRunError: it did not complete.
     """
+    status, details = last_status(link, run_id)
+    if status != COMPLETED:
+        raise FlowerRunError(f"run {run_id} is {status} ({details}); {reason(link.log)}")
+
+
+def last_status(link: SuperLink, run_id: str) -> tuple[str, str]:
+    """Return status and details of a run whose log has ended, once they say so, or after half a minute."""
     for _ in range(STATUS_TRIES):
         status, details = link.status(run_id)
         if status.startswith("finished"):
             break
         time.sleep(POLL_S)
-    if status != "finished:completed":
-        raise FlowerRunError(f"run {run_id} is {status} ({details}); {reason(link.log)}")
+    return status, details
 
 
 def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, what: str) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import IMAGE_SIZE, heed_interrupts
+from cryptography import x509
 from safetensors.numpy import load_file
 
 from fedvla_lib import clients, credentials, deploy, engine, record, run_folder, superlink
@@ -210,6 +211,25 @@ def test_the_recipe_calls_commands_that_this_library_has():
     assert {words[1] for words in calls} >= {"superlink", "deploy", "credentials", "config"}
     for words in calls:
         build_parser().parse_args([word for word in words[1:] if word not in (">", "labs.toml")])
+
+
+@pytest.mark.unit
+def test_a_servers_certificate_also_names_it_as_its_own_helper_calls_it(tmp_path, monkeypatch):
+    """A SuperLink on all addresses starts a helper that calls 127.0.0.1, and without that name no run would start."""
+    monkeypatch.chdir(tmp_path)
+    (recipe,) = [words for words in written_commands("fedvla") if words[1] == "credentials"]
+    assert main(recipe[1:]) == 0
+    certificate = x509.load_pem_x509_certificate((tmp_path / "deployment/server/server.pem").read_bytes())
+    named = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert named.get_values_for_type(x509.DNSName) == ["server.example.org", "localhost"]
+    assert [str(address) for address in named.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
+
+
+@pytest.mark.unit
+def test_the_recipe_registers_a_node_before_it_starts():
+    """A node whose key is not known yet is refused, and ends."""
+    page = (ROOT / "book/deployment.md").read_text()
+    assert page.index("flwr supernode register") < page.index("flower-supernode --root-certificates")
 
 
 @pytest.mark.unit

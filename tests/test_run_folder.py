@@ -1,9 +1,14 @@
 """A run on disk is never overwritten, survives a crash, and reads back as tables."""
 
+import contextlib
 import json
+import os
 import re
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,6 +93,42 @@ def test_an_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ValueError, match="cannot make the run folder .*file.*give a writable folder"):
         make(from_profile("tiny", out=str(tmp_path / "file")))
+
+
+@contextlib.contextmanager
+def read_only(folder):
+    """Meanwhile nobody may write there: root, who may write everywhere, is another user for as long."""
+    is_root, everything = os.geteuid() == 0, [folder, *folder.rglob("*")]
+    for path in everything:
+        path.chmod(0o555)
+    if is_root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if is_root:
+            os.seteuid(0)
+        for path in everything:
+            path.chmod(0o755)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sets POSIX permissions")
+def test_a_read_only_place_is_named_and_left_as_it_is(tmp_path, monkeypatch):
+    """A new run there, and one that is to go on. Its place is open to other users, which pytest's is not."""
+    monkeypatch.setenv("PATH", str(tmp_path))  # without git, which the other user may not ask about this checkout
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        config = from_profile("tiny", out=str(place / "outputs"))
+        with pytest.raises(KeyboardInterrupt), run_folder.start(config, engine="inline") as run:
+            run.log(1, "global", "evaluate", {"loss": 1.0})
+            raise KeyboardInterrupt
+        before = {path: path.read_bytes() for path in place.rglob("*.json*")}
+        with read_only(place):
+            with pytest.raises(ValueError, match=f"cannot make the run folder {place}/outputs/.*Permission denied"):
+                make(config)
+            with pytest.raises(PermissionError, match=str(run.root)):
+                make(replace(config, resume=str(run.root)))
+        assert {path: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -23,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.integration
 @pytest.mark.slow
 def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch, capsys):
-    """As a reader types them: up, and Ctrl-C; up again, `flwr run . local-simulation --stream ...`; down."""
+    """As a reader types them: up, and Ctrl-C; up again, `flwr run . local-simulation --stream ...`; last; down."""
     home = tmp_path / "flwr"
     monkeypatch.setenv("FLWR_HOME", str(home))
     before = (ROOT / "pyproject.toml").read_bytes()
@@ -37,19 +38,26 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
     try:
         assert main(["superlink", "up"]) == 0
         assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
+        assert main(["superlink", "last"]) == 2 and "has had no run yet" in capsys.readouterr().err
         run_app("local-simulation", tiny, "num-supernodes=3")
         (root,) = superlink.run_folders(tiny)
         assert run_folder.read_stamp(root)["status"] == "completed"
         assert run_folder.read_config(root) == tiny
         assert len(run_folder.read_metrics(root, "train")) == 2  # half of three clients
+        assert main(["superlink", "last"]) == 0 and "is finished:completed" in capsys.readouterr().out
+        run_app("local-simulation", replace(tiny, data="nowhere/at/all"), "num-supernodes=3")
+        assert main(["superlink", "last"]) == 2 and "is finished:failed" in capsys.readouterr().out
     finally:
         assert main(["superlink", "down"]) == 0
-    assert main(["superlink", "status"]) == 3
+    assert main(["superlink", "status"]) == 3 and main(["superlink", "last"]) == 2
     assert (ROOT / "pyproject.toml").read_bytes() == before
 
 
 def run_app(connection, config, federation):
-    """Call `flwr run` with settings as the README writes them: on the command line, those that differ."""
+    """Call `flwr run` with settings as the README writes them: on the command line, those that differ.
+
+    It exits with 0 whatever became of the run.
+    """
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
     words = " ".join(f"{name}={json.dumps(value)}" for name, value in told.items())
