@@ -1,4 +1,4 @@
-"""Make a chapter from the template: notebook, checks for its exercises, known mistakes, and its place in the contents.
+"""Make a chapter from the template: notebook, checks for its exercises, known mistakes, and where the book lists it.
 
     python book/new_chapter.py 10_privacy
 """
@@ -41,6 +41,7 @@ def make(root: Path, name: str) -> list[Path]:
         path.write_text(text, encoding="utf-8")
         written.append(path)
     _list(root / "_toc.yml", name)
+    _announce(root / "book" / "index.md", name)
     return written
 
 
@@ -51,6 +52,14 @@ def _list(contents: Path, name: str) -> None:
     indent = lines[last][: lines[last].index("-")]
     lines.insert(last + 1, f"{indent}- file: notebooks/{name}\n")
     contents.write_text("".join(lines), encoding="utf-8")
+
+
+def _announce(front_page: Path, name: str) -> None:
+    """Add the chapter, with a sentence to be replaced, behind the last one of the front page."""
+    before, last, after = front_page.read_text(encoding="utf-8").rpartition("{doc}`/notebooks/")
+    told, end, rest = after.partition("\n\n")
+    added = f"{last}{name}`\n: Say in one sentence what the reader builds here."
+    front_page.write_text(f"{before}{last}{told}{end}{added}{end}{rest}", encoding="utf-8")
 
 
 def main() -> int:

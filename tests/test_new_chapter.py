@@ -25,6 +25,7 @@ def copy(tmp_path_factory):
     (root / "tests" / "wrong_answers").mkdir(parents=True)
     shutil.copy(ROOT / "_toc.yml", root)
     shutil.copytree(ROOT / "book" / "reference" / "comparison", root / "book" / "reference" / "comparison")
+    shutil.copy(ROOT / "book" / "index.md", root / "book")
     new_chapter.make(root, NAME)
     return root
 
@@ -36,10 +37,18 @@ def test_it_is_listed_behind_the_last_chapter(copy):
 
 
 @pytest.mark.unit
+def test_the_front_page_tells_of_it_behind_the_last_chapter(copy):
+    before, after = ((root / "book" / "index.md").read_text() for root in (ROOT, copy))
+    assert test_notebooks.told_on(after) == [*test_notebooks.told_on(before), NAME]
+    added = f"{{doc}}`/notebooks/{NAME}`\n: Say in one sentence what the reader builds here.\n\n"
+    assert after.replace(added, "") == before
+
+
+@pytest.mark.unit
 def test_it_passes_what_every_chapter_passes(copy):
     notebook = copy / "notebooks" / f"{NAME}.ipynb"
     checks = [
-        thing for name, thing in vars(test_notebooks).items() if name.startswith("test_") and "contents" not in name
+        thing for name, thing in vars(test_notebooks).items() if name.startswith("test_") and "no_other" not in name
     ]
     for check in checks:
         check(notebook)

@@ -19,6 +19,11 @@ def cells(path: Path, kind: str = "code") -> list[nbformat.NotebookNode]:
     return [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == kind]
 
 
+def told_on(front_page: str) -> list[str]:
+    """The chapters that the front page lists, each at the margin with its sentence below."""
+    return re.findall(r"^\{doc\}`/notebooks/(\w+)`\n: ", front_page, flags=re.MULTILINE)
+
+
 def has_tag(tag):
     return lambda cell: cell.cell_type == "code" and tag in cell.metadata.get("tags", [])
 
@@ -55,6 +60,10 @@ INSIDE = {
 def test_the_contents_list_every_chapter_and_no_other():
     listed = [page for page in build_book.toc_pages(ROOT) if page.startswith("notebooks/")]
     assert listed == [f"notebooks/{path.stem}" for path in NOTEBOOKS]
+
+
+def test_the_front_page_tells_of_every_chapter_and_no_other():
+    assert told_on((ROOT / "book" / "index.md").read_text()) == [path.stem for path in NOTEBOOKS]
 
 
 @each_chapter
