@@ -37,6 +37,18 @@ def test_wilson_refuses_impossible_counts(k, n):
         compare.wilson(k, n)
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "published"),
+    [
+        ((56, 70), (48, 80), (0.0524, 0.3339)),
+        ((9, 10), (3, 10), (0.1705, 0.8090)),
+        ((5, 56), (0, 29), (-0.0381, 0.1926)),
+    ],
+)
+def test_the_unpaired_difference_is_that_of_newcombe_s_table(left, right, published):
+    assert compare.unpaired_difference(left, right) == pytest.approx(published, abs=6e-5)
+
+
 @pytest.mark.parametrize(("n", "lowest"), [(20, 0.92), (60, 0.93), (100, 0.93), (300, 0.94)])
 def test_wilson_covers_the_truth_as_often_as_it_says(n, lowest):
     """Exact, over rates from 5 to 95 %: on average 95 %; at a single rate counts are whole, and 20 may fall to 92 %."""

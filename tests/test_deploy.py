@@ -17,14 +17,17 @@ import pytest
 import yaml
 from conftest import IMAGE_SIZE, heed_interrupts
 from cryptography import x509
+from flwr.app import RecordDict
 from safetensors.numpy import load_file
 
-from fedvla_lib import clients, credentials, deploy, engine, record, run_folder, superlink
+from fedvla_lib import client_app, clients, credentials, deploy, engine, record, run_folder, superlink
 from fedvla_lib.cli import build_parser, main
 from fedvla_lib.config import from_profile, to_run_config
 
 ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
+# Every kind of thing that a client keeps in Flower's Context: control variate, moments, remainder, own parts.
+KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
 
 
 @pytest.fixture
@@ -35,18 +38,35 @@ def tiny(recording, tmp_path):
     )  # fmt: skip
 
 
+def forget(message, context, call_next):
+    """Around a handler: a client that keeps nothing from one message to the next."""
+    context.state = RecordDict()
+    return call_next(message, context)
+
+
+def apart(left, right):
+    return max(np.abs(left[name] - right[name]).max() for name in left)
+
+
 def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_from_its_own_data(
     tiny, recording, tmp_path
 ):
+    """With all that a client keeps between rounds: nodes that forgot it would end in another model."""
+    tiny = replace(tiny, **KEEPING)
     other = record.record(["lift"], 3, tmp_path / "other", image_size=IMAGE_SIZE, seed=5, progress=False)
     own, said = [recording, other], []
     root = deploy.run_deployed(tiny, tls=True, auth=True, data=own, timeout_s=540, say=said.append)
     assert run_folder.read_stamp(root)["status"] == "completed"
     assert run_folder.read_metrics(root, "rejected").empty
     assert any("round 2, client_1, train: loss" in line for line in said)
-    inline = engine.run_inline(tiny, data=own, progress=False, raise_errors=True)
-    left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
-    assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
+    inline, forgetful = (
+        engine.run_inline(tiny, clients_app=app, data=own, progress=False, raise_errors=True)
+        for app in (None, client_app.build(mods=[forget]))
+    )
+    deployed, kept, forgotten = (
+        load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline, forgetful)
+    )
+    assert apart(deployed, kept) <= 1e-6 and apart(deployed, forgotten) > 1e-4
     held = {f"client_{k}": clients.open_client(tiny, k, own_data=str(path)).num_examples for k, path in enumerate(own)}
     trained = run_folder.read_metrics(root, "train")
     assert held["client_0"] != held["client_1"]  # all of the data set that each was given

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from fedvla_lib import arms, experiment, run_folder
+from fedvla_lib import arms, experiment, run_folder, search
 from fedvla_lib.config import Config, code_digest
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "book" / "reference"
 CELLS = sorted(stamp.parent for stamp in REFERENCE.glob("*/*/stamp.json"))
-SEARCHES = [json.loads(file.read_text())["stamp"] for file in sorted(REFERENCE.glob("search/**/search.json"))]
+SEARCHES = search.read_searches(REFERENCE / "search")
 # Not results: the customary confidence, level and power, and the differences that examples set out to find.
 CUSTOMARY = {"95 %", "80 %", "5 %", "10 points"}
 RESULT = re.compile(r"\d[\d.,]*\s?(?:%|percent\b|points\b)")
@@ -86,10 +86,24 @@ def test_each_stored_cell_was_run_with_the_settings_that_its_file_plans():
                 assert set(last.seed) == set(plan.rollout_seeds), folder
 
 
+def test_stored_searches_are_complete_and_differ_in_the_strategy_alone():
+    """In settings that came after a search was made, the others have to be at the default."""
+    default, first = asdict(Config()), SEARCHES["fedavg"]
+    for name, one in SEARCHES.items():
+        assert (REFERENCE / "search" / name / "search.json").is_file() and one["stamp"]["status"] == "completed"
+        losses = [trial["selection_loss"] for trial in one["trials"]]
+        assert one["selection_loss"] == min(loss for loss in losses if loss is not None)
+        spent = {one[which]["gradient_steps"] for which in ("start", "best")} | {one["budget"]}
+        assert spent == {first["budget"]} and one["start"]["n"] == one["best"]["n"] == first["best"]["n"]
+        settings = default | first["config"] | {"strategy": name}
+        assert one["config"] == {key: settings[key] for key in one["config"]}, name
+
+
 def test_results_of_other_code_carry_a_note():
     notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], code_digest(*arms.TRAINED_BY)
     stamps = [run_folder.read_stamp(cell) for cell in CELLS]
-    stamps += [stamp for stamp in SEARCHES if "code" in stamp]  # the first search is older than the digest
+    # The first search is older than the digest.
+    stamps += [one["stamp"] for one in SEARCHES.values() if "code" in one["stamp"]]
     found = {stamp["code"] for stamp in stamps if stale(stamp, notes, code)}
     assert not found, f"results of code {sorted(found)}, today's is {code}: run them again or add a note"
 

@@ -1,14 +1,16 @@
 """The search spends what it says, goes on where it stopped, and judges on what did not choose."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import optuna
 import pytest
 
 from fedvla_lib import arms, clients, search
 from fedvla_lib.cli import main
-from fedvla_lib.config import code_digest, from_profile
+from fedvla_lib.compare import wilson
+from fedvla_lib.config import Config, code_digest, from_profile
+from fedvla_lib.strategies import SERVER_LR
 
 
 @pytest.mark.unit
@@ -23,16 +25,19 @@ def test_every_trial_has_the_same_budget(strategy):
         assert arms.total_steps(tried) == arms.total_steps(config)
         assert set(trial.params) == {"local_steps", "fraction_train", "lr"} | also
         assert all(getattr(tried, name) == value for name, value in trial.params.items())
+        assert set(trial.params) <= set(search.SEARCHED)
 
 
 @pytest.mark.integration
 def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, capsys):
     command = ["search", "--profile", "tiny", "--data", str(recording), "--tasks", "lift,push", "--num-clients", "2"]
-    command += ["--val-fraction", "0.5", "--rollouts", "1", "--search-out", str(tmp_path)]
+    out = tmp_path / "fedavg"
+    command += ["--val-fraction", "0.5", "--rollouts", "1", "--search-out", str(out)]
     assert main([*command, "--trials", "1"]) == 0
-    first = json.loads((tmp_path / "search.json").read_text())
+    first = json.loads((out / "search.json").read_text())
     assert main([*command, "--trials", "2"]) == 0
-    found = json.loads((tmp_path / "search.json").read_text())
+    found = json.loads((out / "search.json").read_text())
+    assert search.compared(search.read_searches(tmp_path)).trials.to_list() == [2, 2]
     said = capsys.readouterr().out
     assert f"2 trials of {found['budget']} gradient steps" in said and "winner: " in said
     assert found["trials"][0] == first["trials"][0] and len(found["trials"]) == 2
@@ -80,3 +85,53 @@ def test_a_trial_that_diverges_counts_and_does_not_end_the_search(recording, tmp
     found = json.loads((tmp_path / "search.json").read_text())
     assert [trial["selection_loss"] is None for trial in found["trials"]] == [True, False]
     assert found["config"]["data"] == str(recording) and found["stamp"]["status"] == "completed"
+
+
+def found_by(strategy, losses, **also):
+    """What a search leaves behind, as far as tables need it."""
+    config = asdict(from_profile("laptop", strategy=strategy, lr=1e-3, local_steps=5, fraction_train=0.4))
+    winner = {"local_steps": 2, "fraction_train": 0.1, "lr": 2e-3, **also}
+    trials = [{"number": i, **winner, "selection_loss": loss} for i, loss in enumerate(losses)]
+    report = {"loss": 0.3, "n": 30, "successes": 12}
+    return {
+        "config": config, "winner": winner, "trials": trials, "selection_loss": 0.1, "start": report,
+        "best": report | {"loss": 0.2, "successes": 21},
+    }  # fmt: skip
+
+
+@pytest.mark.unit
+def test_searches_are_read_by_strategy_and_compared_line_by_line(tmp_path):
+    given = [
+        found_by("fedadam", [0.2, 0.1, 0.4], server_lr=0.05), found_by("fedprox", [None, 0.1], proximal_mu=2.0),
+        found_by("fedavg", [0.1]),
+    ]  # fmt: skip
+    for number, found in enumerate(given):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "search.json").write_text(json.dumps(found))
+    searches = search.read_searches(tmp_path)
+    assert searches == {found["config"]["strategy"]: found for found in given}
+    table = search.compared(searches).set_index(["strategy", "settings"])
+    assert [name for name, _ in table.index[::2]] == ["fedavg", "fedprox", "fedadam"]  # as strategies are listed
+    assert table.trials.to_list() == [1, 1, 2, 2, 3, 3] and table.diverged.to_list() == [0, 0, 1, 1, 0, 0]
+    start, winner = (table.xs(which, level="settings") for which in ("start", "winner"))
+    assert (start[["lr", "local_steps", "fraction_train"]] == [1e-3, 5, 0.4]).all(axis=None)
+    assert (winner[["lr", "local_steps", "fraction_train"]] == [2e-3, 2, 0.1]).all(axis=None)
+    assert start.server_lr.dropna().to_dict() == {"fedadam": SERVER_LR["fedadam"]}  # 0 stands for this
+    assert winner.server_lr.dropna().to_dict() == {"fedadam": 0.05}
+    assert start.proximal_mu.dropna().to_dict() == {"fedprox": Config.proximal_mu}
+    assert winner.proximal_mu.dropna().to_dict() == {"fedprox": 2.0}
+    assert start.selection_loss.isna().all() and (winner.selection_loss == 0.1).all()
+    assert (start.loss == 0.3).all() and (winner.loss == 0.2).all()
+    assert (start.success_rate == 0.4).all() and (winner.success_rate == 0.7).all()
+    assert [*winner.loc["fedavg", ["low", "high"]]] == [*wilson(21, 30)]
+
+
+@pytest.mark.unit
+def test_no_search_and_two_of_one_strategy_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="has 0 searches"):
+        search.read_searches(tmp_path)
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "search.json").write_text(json.dumps(found_by("fedavg", [0.1])))
+    with pytest.raises(ValueError, match="has 2 searches of 1 strategies"):
+        search.read_searches(tmp_path)
