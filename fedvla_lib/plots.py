@@ -681,16 +681,22 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
 
 
 def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success against what travelled, a labelled point a line; columns arm, MB, success_rate, low, high."""
+    """Draw success against what travelled, a labelled point a line; columns arm, MB, success_rate, low, high.
+
+    Points of equal MB would hide each other: they stand side by side, around their place.
+    """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 4.6), layout="constrained")
-    for i, row in enumerate(table.itertuples()):
+    alike = table.groupby(table.MB.round()).cumcount()
+    middle = (table.groupby(table.MB.round()).MB.transform("size") - 1) / 2
+    places = table.MB * 1.08 ** (alike - middle)
+    for i, (place, row) in enumerate(zip(places, table.itertuples(), strict=True)):
         errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
         color, marker = arm_color(row.arm, i), "osD^vP*X"[(i + i // 8) % 8]
-        ax.errorbar(row.MB, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
+        ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
-    ax.set_xlabel("everything that travelled [MB]")
+    ax.set_xlabel("everything that travelled [MB], equals side by side")
     ax.set_ylabel("success rate [%], 95 % interval")
     ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     return ax

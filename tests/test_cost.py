@@ -71,6 +71,7 @@ def test_what_a_build_measured_is_kept_and_shown(tmp_path):
     shown = cost.measured("01_a", kept.parent)
     assert shown.loc["tiny", "time [s]"] == "8" and float(shown.loc["tiny", "memory [MB]"].replace(",", "")) > 10
     assert set(shown.loc["laptop"]) == {"–"}
+    assert shown.to_html().split("</thead>")[0].count("<tr") == 1, "one row of heads, in a small box"
     assert cost.measured("02_b", kept.parent).loc["tiny"].tolist()[:3] == ["8", "–", "–"]
     assert set(cost.measured("03_c", kept.parent).to_numpy().ravel()) == {"–"}
 

@@ -305,6 +305,14 @@ def test_success_by_bytes_names_every_point():
     np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata(), [[100, 90]])
 
 
+def test_success_by_bytes_sets_points_of_equal_bytes_apart():
+    same = pd.DataFrame({"arm": list("abc"), "MB": [10.0, 600.0, 600.0], "success_rate": 0.9, "low": 0.8, "high": 1.0})
+    ax = plots.success_by_bytes(same)
+    alone, left, right = (container.lines[0].get_xdata()[0] for container in ax.containers)
+    assert alone == 10 and 0.9 * 600 < left < 600 < right < 1.1 * 600
+    np.testing.assert_allclose(left * right, 600**2)
+
+
 def checkpoint_table():
     return pd.DataFrame(
         {"arm": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],
