@@ -3,15 +3,17 @@
 import time
 
 import pytest
-from flwr.app import Message, MessageType, RecordDict
+from flwr.app import Context, Message, MessageType, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.server.superlink.linkstate import LinkStateFactory
 from flwr.supercore.object_store import ObjectStoreFactory
 from flwr.superlink.federation import NoOpFederationManager
 from flwr.superlink.grid import InMemoryGrid
 
-from fedvla_lib.engine import InlineGrid, claim_identity
-from fedvla_lib.grid import FewAtOnce, for_simulation
+from fedvla_lib import server_app
+from fedvla_lib.config import from_profile, to_run_config
+from fedvla_lib.engine import RUN_ID, InlineGrid, claim_identity
+from fedvla_lib.grid import MESSAGES_AT_ONCE, FewAtOnce, for_simulation
 
 pytestmark = pytest.mark.unit
 CLIENTS = 10
@@ -57,7 +59,29 @@ def test_who_was_not_asked_in_time_has_not_replied():
     assert 1 <= len(replies) < CLIENTS
 
 
+def in_memory(kind=InMemoryGrid) -> InMemoryGrid:
+    return kind(LinkStateFactory(":flwr-in-memory:", NoOpFederationManager(), ObjectStoreFactory()))
+
+
 def test_only_the_grid_of_the_simulation_is_limited():
-    memory = InMemoryGrid(LinkStateFactory(":flwr-in-memory:", NoOpFederationManager(), ObjectStoreFactory()))
-    assert isinstance(for_simulation(memory), FewAtOnce)
+    assert isinstance(for_simulation(in_memory()), FewAtOnce)
     assert for_simulation(inline := grid_of()) is inline
+
+
+class Asked(InMemoryGrid):
+    """The simulation's grid with many clients; stops the run at the first messages, and says how many they were."""
+
+    def get_node_ids(self):
+        return range(1, 1 + 2 * MESSAGES_AT_ONCE)
+
+    def push_messages(self, messages):
+        raise InterruptedError(len(list(messages)))
+
+
+def test_the_server_of_a_simulation_asks_few_clients_at_a_time(recording, tmp_path):
+    claim_identity()
+    config = from_profile("tiny", data=str(recording), num_clients=2 * MESSAGES_AT_ONCE, out=str(tmp_path))
+    context = Context(RUN_ID, 0, {}, RecordDict(), to_run_config(config))
+    with pytest.raises(InterruptedError) as asked:
+        server_app.build()(in_memory(Asked), context)
+    assert asked.value.args == (MESSAGES_AT_ONCE,)
