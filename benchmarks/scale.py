@@ -31,7 +31,7 @@ from fedvla_lib.run_folder import GLOBAL, read_events
 MARK = "FEDVLA_BENCHMARK"  # in the environment of every process of one measurement
 ENGINES = {"inline": engine.run_inline, "simulation": superlink.run_simulation}
 MERGED_AT_ONCE = 6
-RATIO = "by client, against fewer clients"
+PER_CLIENT, RATIO = "later, per client [ms]", "against fewer clients"
 
 
 def main() -> None:
@@ -71,9 +71,9 @@ def compared(rows: list[dict[str, object]]) -> list[dict[str, object]]:
     """
     whole, before = [], {}
     for row in sorted(rows, key=lambda row: (list(ENGINES).index(row["engine"]), row["clients"])):
-        cost = row["later rounds, by client [ms]"]
+        cost = row[PER_CLIENT]
         ratio = cost / before[row["engine"]] if row["engine"] in before else None
-        whole.append({**{k: v for k, v in row.items() if k != RATIO}, RATIO: ratio})
+        whole.append({**row, RATIO: ratio})
         before[row["engine"]] = cost
     return whole
 
@@ -130,8 +130,8 @@ def measure(settings: dict, profile: str) -> dict[str, float]:
     first, *later = round_seconds(run)
     warm, count = statistics.median(later), settings["num_clients"]
     return {
-        "first round [s]": first, "later rounds [s]": warm, "later rounds, by client [ms]": 1000 * warm / count,
-        "peak memory [MB]": max(peaks), "peak memory, by client [MB]": max(peaks) / count,
+        "first round [s]": first, "later rounds [s]": warm, "peak memory [MB]": max(peaks),
+        PER_CLIENT: 1000 * warm / count,
     }  # fmt: skip
 
 

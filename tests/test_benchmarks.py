@@ -81,8 +81,8 @@ def test_rounds_are_timed_for_each_number_of_clients(tmp_path):
     assert [row["clients"] for row in rows] == [2, 13]  # more than the recording has episodes
     assert rows[0] == before  # measured once, and kept
     assert all(row["later rounds [s]"] > 0 and row["peak memory [MB]"] > 100 for row in rows)
-    few, many = (row["later rounds, by client [ms]"] for row in rows)
-    assert [row["by client, against fewer clients"] for row in rows] == [None, pytest.approx(many / few)]
+    few, many = (row["later, per client [ms]"] for row in rows)
+    assert [row["against fewer clients"] for row in rows] == [None, pytest.approx(many / few)]
 
 
 def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path):
