@@ -27,6 +27,7 @@ ARM_FAMILIES = {  # what a stored arm's name begins with -> its colour; a cadenc
     "scaffold": "#D55E00",
     "fedprox": "#CC79A7",
 }
+DASHES = ("-", "--", "-.")
 # Okabe and Ito's, then two of Tol's muted scheme: ten clients is what a federation of this book has.
 CLIENT_COLORS = (*PALETTE[:6], "#117733", "#000000", "#882255", "#7F7F7F")
 WIDTH = 7  # inches; on a page a wider figure shrinks, and its text with it
@@ -633,10 +634,15 @@ def save(axes: Axes | Sequence[Axes], path: Path) -> None:
 
 
 def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
-    """Draw each column of a table against its index; a column named ``optimum`` is a dotted line."""
+    """Draw each column of a table against its index; a column named ``optimum`` is a dotted line.
+
+    Columns of one colour, such as two runs of one arm, differ by their dashes.
+    """
     ax = ax or _new_axes()
+    colors = [_column_color(str(name), i) for i, name in enumerate(table.columns)]
     for i, name in enumerate(table.columns):
-        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": _column_color(str(name), i)}
+        dashes = DASHES[colors[:i].count(colors[i]) % len(DASHES)]
+        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": colors[i], "linestyle": dashes}
         ax.plot(table.index, table[name], label=name, **look)
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)

@@ -320,6 +320,13 @@ def checkpoint_table():
     )  # fmt: skip
 
 
+def test_two_curves_of_one_arm_can_be_told_apart():
+    table = pd.DataFrame({"FedAvg, nobody attacks": [3.0, 1.0], "FedAvg": [3.0, 4.0], "Krum": [3.0, 2.0]})
+    honest, attacked, krum = plots.curves(table, xlabel="round", ylabel="loss").get_lines()
+    assert honest.get_color() == attacked.get_color() != krum.get_color()
+    assert honest.get_linestyle() != attacked.get_linestyle() and krum.get_linestyle() == "-"
+
+
 def test_learning_curves_show_mean_and_range_over_seeds():
     axes = plots.learning_curves(checkpoint_table())
     assert all(map(labelled, axes)) and axes[0].get_yscale() == "log"
