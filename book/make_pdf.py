@@ -20,6 +20,16 @@ ROOT = Path(__file__).resolve().parents[1]
 TARGET = "_build/fedvla-book.pdf"
 LOAD_S = 600  # a page with all figures and videos of the book
 MARGIN = {"top": "18mm", "bottom": "18mm", "left": "16mm", "right": "16mm"}
+SCALE = 0.75  # letters of a printed book, and lines of code that fit
+# On paper nothing scrolls, and what belongs together stays on one page.
+STYLE = """
+td, th { white-space: normal !important; }
+pre, pre code { white-space: pre-wrap !important; overflow-wrap: anywhere; }
+figure, img, video, tr, div.math, div.cell_input, div.admonition { break-inside: avoid; }
+div.cell, div.cell_output, .table-wrapper { overflow: visible !important; }
+h1, h2, h3, h4, summary { break-after: avoid; }
+section.mathjax_ignore > h2 { break-before: page; } /* a chapter */
+"""
 # On paper nothing can be opened, and a lazy picture that was never in view is blank.
 PREPARE = """async () => {
   document.documentElement.dataset.mode = document.documentElement.dataset.theme = 'light';
@@ -68,8 +78,10 @@ def print_page(page: Path, target: Path) -> Path:
         shown = browser.new_page()
         shown.set_default_timeout(1000 * LOAD_S)
         shown.goto(page.resolve().as_uri(), wait_until="networkidle")
+        shown.add_style_tag(content=STYLE)
         shown.evaluate(PREPARE)
-        shown.pdf(path=unfinished, format="A4", margin=MARGIN, print_background=True, outline=True, tagged=True)
+        paper = {"format": "A4", "margin": MARGIN, "scale": SCALE}
+        shown.pdf(path=unfinished, print_background=True, outline=True, tagged=True, **paper)
         browser.close()
     return unfinished.replace(target)
 

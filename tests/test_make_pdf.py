@@ -27,6 +27,15 @@ def test_a_page_is_printed_with_what_folds_out(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["book.pdf"]
 
 
+@pytest.mark.integration
+def test_a_chapter_begins_a_page_and_a_short_cell_stays_on_one(tmp_path):
+    """The second chapter's text leaves room for half of its cell."""
+    cell = "<div class='cell_input' style='height: 160mm'>code</div>"
+    chapters = [f"<section class='mathjax_ignore'><h2>{n}</h2><div style='height: {n}mm'></div>{cell}" for n in (1, 260)]
+    (tmp_path / "page.html").write_text(f"<!DOCTYPE html><h1>Book</h1>{'</section>'.join(chapters)}</section>")
+    assert number_of_pages(make_pdf.print_page(tmp_path / "page.html", tmp_path / "book.pdf").read_bytes()) == 4
+
+
 @pytest.mark.unit
 def test_chapters_that_were_not_executed_are_named(project):  # noqa: F811
     with pytest.raises(build_book.BookError, match="profile tiny.*: one; run make book"):
