@@ -19,6 +19,7 @@ from fedvla_lib.config import Config, check
 from fedvla_lib.superlink import CONNECTION, FlowerRunError, SuperLink
 
 CONNECTED = "SuperNode ID:"  # what a SuperNode logs once the SuperLink has let it in
+UNTRUSTED = "CERTIFICATE_VERIFY_FAILED"  # what it logs at each try if the SuperLink is none that it trusts
 SHOWN = ("loss", "success_rate", "num_examples", "reason", "detail")
 
 
@@ -44,7 +45,7 @@ class Deployment:
         node that was in before this tries again, as a host's service manager would.
 
         Raises:
-            FlowerRunError: it was refused, or did not get through; the message holds its own words.
+            FlowerRunError: it was refused, refuses the SuperLink, or did not get through; with its own words.
         """
         was_in = _count(self.log(partition_id)) > 0
         deadline = time.monotonic() + superlink.STARTUP_S
@@ -59,10 +60,13 @@ class Deployment:
     def _try_node(self, partition_id: int) -> None:
         log = self.log(partition_id)
         log.parent.mkdir(exist_ok=True)
-        before = _count(log)
+        before, distrusted = _count(log), _count(log, UNTRUSTED)
         node = superlink.start(self._command(partition_id), superlink.flower_environment(log.parent), log)
         self.nodes[partition_id] = node
-        superlink.wait_until(lambda: _count(log) > before, node, log, f"the SuperNode of client {partition_id}")
+        who = f"the SuperNode of client {partition_id}"
+        superlink.wait_until(lambda: _count(log) > before or _count(log, UNTRUSTED) > distrusted, node, log, who)
+        if _count(log) == before:  # it would try again for ever
+            raise FlowerRunError(f"{who} does not trust the SuperLink; {superlink.reason(log)}")
 
     def kill_node(self, partition_id: int) -> None:
         """End a SuperNode without warning, as a power cut does, and what it had started."""
@@ -181,5 +185,5 @@ def news(config: Config, before: set[Path], say: Callable[[str], None]) -> Calla
     return tell
 
 
-def _count(log: Path) -> int:
-    return log.read_text(errors="replace").count(CONNECTED) if log.exists() else 0
+def _count(log: Path, words: str = CONNECTED) -> int:
+    return log.read_text(errors="replace").count(words) if log.exists() else 0

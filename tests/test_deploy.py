@@ -89,21 +89,24 @@ def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
 
 
 def refusal(node_of: deploy.Deployment) -> str:
-    """Start a SuperNode of the deployment, and return its log once that says that it does not trust the server."""
-    log = node_of.log(0)
-    log.parent.mkdir(parents=True)
-    node = superlink.start(node_of._command(0), superlink.flower_environment(log.parent), log)
-    try:
-        superlink.wait_until(lambda: "CERTIFICATE_VERIFY_FAILED" in log.read_text(), node, log, "the refusal")
-    finally:
-        superlink.stop(node)
-    return log.read_text()
+    """Start a SuperNode of the deployment, which has to refuse the server at once, and return its log."""
+    with pytest.raises(superlink.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
+        node_of.start_node(0)
+    superlink.stop(node_of.nodes[0])
+    return node_of.log(0).read_text()
 
 
-def test_a_node_that_trusts_another_authority_does_not_talk_to_the_server(standing, tmp_path):
+def test_nodes_and_users_that_trust_another_authority_do_not_talk_to_the_server(standing, tmp_path):
     elsewhere = credentials.make_server(tmp_path / "elsewhere")
     astray = replace(standing, link=replace(standing.link, files=elsewhere), nodes={}, folder=tmp_path)
     assert deploy.CONNECTED not in refusal(astray)
+    known = (standing.folder / "config.toml").read_text()
+    assert str(standing.link.files.authority) in known
+    (tmp_path / "config.toml").write_text(known.replace(str(standing.link.files.authority), str(elsewhere.authority)))
+    user = replace(standing.link, environment=superlink.flower_environment(tmp_path))
+    with pytest.raises(superlink.FlowerRunError, match="flwr list failed"):
+        user.ask("list", superlink.CONNECTION)
+    assert "runs" in standing.link.ask("list", superlink.CONNECTION)  # of those who trust the right one
 
 
 def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tmp_path, monkeypatch):
