@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 from conftest import heed_interrupts
 from safetensors.numpy import load_file, save_file
 
-from fedvla_lib import checkpoint, engine, run_folder, superlink
+from fedvla_lib import checkpoint, engine, run_folder, server_app, superlink
 from fedvla_lib.checkpoint import Checkpoint
 from fedvla_lib.cli import main
 from fedvla_lib.config import from_profile, to_run_config
@@ -148,6 +149,30 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
     assert main(["run", "--resume", str(done)]) == 2
     assert "is damaged" in capsys.readouterr().err
     assert json.loads((done / "stamp.json").read_text())["status"].startswith("failed")
+
+
+@pytest.mark.unit
+def test_an_engine_that_cannot_reach_what_clients_keep_says_so_instead_of_resuming(tmp_path):
+    """In a deployment it lies with the clients, and is gone with the run."""
+    run, resumed = run_folder.RunFolder(tmp_path), from_profile("tiny", resume=str(tmp_path))
+    checkpoint.save(tmp_path, Checkpoint(2, {"w": np.ones(3, np.float32)}, {}, {}))
+    run.log(2, "global", "evaluate", {"loss": 1.0})
+    for setting, value in KEEPING.items():
+        with pytest.raises(ValueError, match="lets clients keep something .* resume on engine inline, or start anew"):
+            server_app._before(replace(resumed, **{setting: value}), run, None)
+    assert server_app._before(resumed, run, None).round == 2
+
+
+@pytest.mark.unit
+def test_a_damaged_checkpoint_is_named_and_once_removed_the_one_before_is_taken(tmp_path):
+    for number in (1, 2):
+        checkpoint.save(tmp_path, Checkpoint(number, {"w": np.ones(3, np.float32)}, {}, {}))
+    newest = tmp_path / "checkpoints" / "round_2"
+    (newest / "arrays.safetensors").write_bytes(b"half of it")
+    with pytest.raises(ValueError, match=f"{newest} is damaged .*remove it to go on from the round before"):
+        checkpoint.load(tmp_path)
+    shutil.rmtree(newest)
+    assert checkpoint.load(tmp_path).round == 1
 
 
 @pytest.mark.unit

@@ -198,6 +198,7 @@ FAULTS = {
     "wrong shape": ("shape", lambda: reply_content({**GOOD, "bias": np.zeros(4, np.float32)})),
     "renamed array": ("names", lambda: reply_content({("W" if n == "weight" else n): a for n, a in GOOD.items()})),
     "missing array": ("names", lambda: reply_content(_without(GOOD, "gain"))),
+    "an array too many": ("names", lambda: reply_content({**GOOD, "more": np.zeros(3, np.float32)})),
     "wrong dtype": ("dtype", lambda: reply_content({n: a.astype(np.float64) for n, a in GOOD.items()})),
     "undecodable bytes": ("dtype", lambda: _with_bias(b"not an array")),
     "a pickle": ("dtype", lambda: _with_bias(_pickled(), "object", (1,))),
