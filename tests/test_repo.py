@@ -1,6 +1,7 @@
 """What must hold of the files themselves, whatever the code does."""
 
 import re
+import shlex
 import subprocess
 import tomllib
 from pathlib import Path
@@ -8,6 +9,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from fedvla_lib.cli import build_parser
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parent.parent
@@ -68,6 +71,41 @@ def test_readme_commands_exist():
     for page in ["README.md", "CONTRIBUTING.md", *(f"book/{name}.md" for name in ("index", "setup", "how_to_read"))]:
         used = set(re.findall(r"(?:^|[`\s])make ([a-z-]+)", code_of(page), flags=re.MULTILINE))
         assert used <= targets, f"{page} names {sorted(used - targets)}"
+
+
+def shell_lines() -> list[tuple[str, list[str]]]:
+    """What the pages tell readers to type: the page, and the words of each line."""
+    found = []
+    for page in ["README.md", "CONTRIBUTING.md", *(f"book/{path.name}" for path in (ROOT / "book").glob("*.md"))]:
+        blocks = re.findall(r"^```bash\n(.*?)^```", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+        lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+        found += [(page, words) for line in lines if (words := shlex.split(line, comments=True))]
+    return found
+
+
+def test_every_fedvla_command_of_a_page_parses():
+    calls = [(page, words) for page, words in shell_lines() if Path(words[0]).name == "fedvla"]
+    assert {"README.md", "book/deployment.md", "book/how_to_read.md"} <= {page for page, _ in calls}
+    for page, (_, *words) in calls:
+        told = words[: words.index(">")] if ">" in words else words
+        try:
+            build_parser().parse_args(told)
+        except SystemExit as ended:
+            assert ended.code == 0, f"{page}: fedvla {' '.join(told)}"  # --help
+
+
+def test_every_script_that_a_page_names_is_there():
+    scripts = {words[1] for _, words in shell_lines() if Path(words[0]).name == "python"}
+    assert scripts and not [name for name in scripts if not (ROOT / name).is_file()]
+
+
+def test_every_page_of_the_book_is_linked_from_another():
+    """Not only from the list of contents; the bibliography is linked by what cites it."""
+    texts = {path.stem: path.read_text() for path in (ROOT / "book").glob("*.md")}
+    texts |= {path.stem: path.read_text() for path in (ROOT / "notebooks").glob("*.ipynb")}
+    links = ((page, name) for page, text in texts.items() for name in re.findall(r"\{doc\}`([^`]+)`", text))
+    linked = {target for page, name in links if (target := name.split("/")[-1].strip("<>")) != page}
+    assert set(texts) - linked == {"index", "bibliography"}
 
 
 def code_of(page: str) -> str:
