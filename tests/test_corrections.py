@@ -7,6 +7,7 @@ from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from fedvla_lib import strategies, wire
+from fedvla_lib.checkpoint import flat, nested
 from fedvla_lib.client_app import correction_for, hand_in
 from fedvla_lib.config import Config
 from fedvla_lib.corrections import ControlVariates, Proximal
@@ -59,21 +60,33 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
     return app
 
 
-def federate(rounds, examples=(1, 1), share=1.0, **settings):
-    """Run a strategy on the two quadratics from w = 0; return w after each round and the strategy."""
-    grid = InlineGrid(quadratic_app(examples), 2, {}, raise_errors=True)
+def serving(grid, examples, share, rounds_done=0, **settings):
+    """The strategy of these settings, for the two clients of the grid."""
     nodes = grid.get_node_ids()
     weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
-    strategy = strategies.build(
+    return strategies.build(
         Config(**settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
-        report=lambda *_: None, keep_rollouts=lambda *_: None, train_share=share,
+        report=lambda *_: None, keep_rollouts=lambda *_: None, train_share=share, rounds_done=rounds_done,
     )  # fmt: skip
+
+
+def federate(rounds, examples=(1, 1), share=1.0, replaced_after=0, **settings):
+    """Run a strategy on the two quadratics from w = 0; return w after each round, the strategy and the clients' state.
+
+    After `replaced_after` rounds another server goes on with what a checkpoint has of the first.
+    """
+    grid, done = InlineGrid(quadratic_app(examples), 2, {}, raise_errors=True), 0
+    strategy = serving(grid, examples, share, **settings)
     arrays, path = wire.pack_arrays({"w": np.zeros(1, np.float32)}), []
-    for server_round in range(1, rounds + 1):
-        replies = grid.send_and_receive(strategy.configure_train(server_round, arrays, ConfigRecord(), grid))
-        arrays, _ = strategy.aggregate_train(server_round, replies)
+    for number in range(1, rounds + 1):
+        if number - 1 == replaced_after > 0:
+            kept, done = nested(flat(strategy.memory())), replaced_after
+            strategy = serving(grid, examples, share, done, **settings)
+            strategy.remember(kept)
+        replies = grid.send_and_receive(strategy.configure_train(number - done, arrays, ConfigRecord(), grid))
+        arrays, _ = strategy.aggregate_train(number - done, replies)
         path.append(float(wire.unpack_arrays(arrays)["w"][0]))
-    return path, strategy
+    return path, strategy, grid.client_states()
 
 
 def optimum(examples=(1, 1)):
@@ -119,7 +132,7 @@ def test_scaffold_equals_a_computation_by_hand():
         server += sum((new - old) / 2 for new, old in zip(fresh, own, strict=True))
         own, w = fresh, sum(ends) / 2
         expected.append(w)
-    path, strategy = federate(3, strategy="scaffold")
+    path, strategy, _ = federate(3, strategy="scaffold")
     np.testing.assert_allclose(path, expected, rtol=1e-5)
     np.testing.assert_allclose(strategy.control["w"], server, rtol=1e-5)
 
@@ -140,6 +153,15 @@ def test_control_variates_sum_to_zero_over_clients():
             changes.append(control.change()["w"])
         server = {"w": server["w"] + np.mean(changes, axis=0)}
         assert np.abs(sum(c["w"] - server["w"] for c in own)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("examples", "share"), [((1, 1), 1.0), ((3, 1), 1.0), ((1, 9), 0.5)])
+def test_what_the_server_adds_up_is_the_weighted_mean_of_what_clients_keep(examples, share):
+    """So sum_k p_k (c_k - c) = 0, whoever was drawn: through the strategy and Flower's Context."""
+    _, strategy, kept = federate(7, examples, share, strategy="scaffold")
+    own = [kept[f"{FIRST_NODE_ID + k}:{wire.CONTROL}"]["w"] for k in range(2)]
+    assert abs(own[0] - own[1]) > 0.1
+    np.testing.assert_allclose(np.average(own, axis=0, weights=examples), strategy.control["w"], atol=1e-5)
 
 
 def test_a_parameter_without_gradient_has_a_control_variate_of_zero():
@@ -209,12 +231,19 @@ def test_adaptive_strategies_equal_a_float64_reference(name):
         rate = 0.05 * np.sqrt(1 - 0.99 ** (step + 1)) / (1 - 0.9 ** (step + 1)) if name == "fedadam" else 0.05
         w += rate * m / (np.sqrt(v) + 1e-3)
         path.append(w)
-    found, _ = federate(4, strategy=name, server_lr=0.05)
+    found, *_ = federate(4, strategy=name, server_lr=0.05)
     np.testing.assert_allclose(found, path, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["fedavgm", "fedadam", "fedyogi", "scaffold"])
+def test_a_server_that_takes_over_goes_on_with_the_memory_of_the_first(name):
+    """Momentum, second moments, control variate, the number of the round and who is drawn in it."""
+    settings = {"strategy": name, "share": 0.5}
+    assert federate(8, replaced_after=4, **settings)[0] == federate(8, **settings)[0]
+
+
 def test_the_median_ignores_weights():
-    path, _ = federate(1, (1, 100), strategy="fedmedian")
+    path, *_ = federate(1, (1, 100), strategy="fedmedian")
     ends = [TARGET[k] * (1 - shrink(k)) for k in range(2)]
     assert path[0] == pytest.approx(np.median(ends), rel=1e-5)
 

@@ -13,11 +13,12 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from flwr.app import RecordDict
 from flwr.cli.build import build_fab_from_disk
 from flwr.cli.config_utils import load_and_validate
 from safetensors.numpy import load_file
 
-from fedvla_lib import engine, run_folder, superlink
+from fedvla_lib import client_app, engine, run_folder, superlink
 from fedvla_lib.cli import main
 from fedvla_lib.config import from_profile, from_run_config
 
@@ -40,6 +41,12 @@ def tiny(recording, tmp_path):
     )
 
 
+def forget(message, context, call_next):
+    """Around a handler: a client that keeps nothing from one message to the next."""
+    context.state = RecordDict()
+    return call_next(message, context)
+
+
 def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     """Two rounds with everything that a client keeps from one to the next: control variate, optimiser, remainder."""
     tiny = replace(tiny, num_server_rounds=2, strategy="scaffold", keep_optimizer=True, exchange="int8")
@@ -55,10 +62,16 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     assert sorted(videos.index) == ["client_0", "client_1", "client_2"]
     assert all((root / video).stat().st_size > 1000 for video in videos)
     assert PYPROJECT.read_bytes() == before
-    inline = engine.run_inline(replace(tiny, client_rollouts=0), progress=False, raise_errors=True)
-    left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
+    inline, forgetful = (
+        engine.run_inline(replace(tiny, client_rollouts=0), clients_app=app, progress=False, raise_errors=True)
+        for app in (None, client_app.build(mods=[forget]))
+    )
+    left, right, other = (
+        load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline, forgetful)
+    )
     assert left.keys() == right.keys()
     assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
+    assert max(np.abs(left[name] - other[name]).max() for name in left) > 1e-4  # workers that forgot would end there
     ledgers = [run_folder.read_metrics(one, "replies").query("to == 'train'") for one in (root, inline)]
     columns = ["round", "good", "sent_bytes", "received_bytes"]
     np.testing.assert_allclose(*(ledger[columns].astype(float) for ledger in ledgers), rtol=1e-4)

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from flwr.app import Context, RecordDict
 
+from fedvla_lib import client_app, wire
 from fedvla_lib.config import EXCHANGES
 from fedvla_lib.params import ParameterError
 from fedvla_lib.quantise import DOWNWARD, SCALE, check_encoded, decode, encode, with_feedback
@@ -59,6 +61,20 @@ def test_with_feedback_the_sum_over_rounds_is_right_up_to_one_rounding(exchange)
     if exchange == "int8":
         assert (without[0] == 0).all()  # lost in every round
         assert abs(arrived[0].mean() - told[0].mean()) < 0.5 * told[0].mean()
+
+
+@pytest.mark.parametrize("exchange", ROUNDED)
+def test_a_client_keeps_the_remainder_in_its_context_and_sends_it_later(exchange):
+    start, context = change(99, scale=1.0), Context(1, 2, {}, RecordDict(), {})
+    arrived, told = np.zeros(SHAPES["weight"]), np.zeros(SHAPES["weight"])
+    for number in range(60):
+        after = {name: start[name] + array for name, array in change(number).items()}
+        told += after["weight"] - start["weight"]
+        sent = client_app._outgoing(after, start, exchange, context)
+        arrived += decode(sent, exchange)["weight"]
+    left_over = wire.unpack_arrays(context.state[client_app.LEFT_OVER])["weight"]
+    np.testing.assert_allclose(arrived + left_over, told, atol=1e-6)
+    assert left_over.any()
 
 
 def test_what_cannot_be_decoded_is_refused():

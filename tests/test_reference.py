@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fedvla_lib import arms, experiment, run_folder, search
+from fedvla_lib import arms, experiment, results, run_folder, search
 from fedvla_lib.config import Config, code_digest
 
 pytestmark = pytest.mark.unit
@@ -49,6 +49,8 @@ def test_each_stored_cell_is_complete_and_stamped():
         stamp = run_folder.read_stamp(cell)
         assert stamp["status"] == "completed" and stamp["commit"] and stamp["config_hash"], cell
         assert len(run_folder.read_metrics(cell, "rollout")) and len(run_folder.read_metrics(cell, "evaluate")), cell
+        # Less is what it takes to find a trained model in the cache.
+        assert stamp["kind"] == "base" or stamp["train_s"] is None or stamp["train_s"] > 1, cell
 
 
 def test_each_stored_cell_is_one_that_its_file_asks_for():
@@ -84,6 +86,16 @@ def test_each_stored_cell_was_run_with_the_settings_that_its_file_plans():
             last = attempts[attempts["round"] == attempts["round"].max()]
             if cell.kind != "clients":  # each of those has seeds of its own
                 assert set(last.seed) == set(plan.rollout_seeds), folder
+
+
+@pytest.mark.parametrize("name", ["strategies", "communication", "multitask"])
+def test_cells_of_a_grid_spend_equal_steps_and_have_three_seeds_and_fifty_attempts_at_each_task(name):
+    rows = results.read_results(REFERENCE / name)
+    assert rows.gradient_steps.nunique() == 1
+    assert (rows.groupby(["partition", "arm"]).run.nunique() >= 3).all()
+    runs = rows.groupby(["partition", "arm", "run"])
+    assert (runs.task.nunique() == rows.task.nunique()).all()
+    assert (rows.groupby([*runs.keys, "task"]).seed.nunique() >= 50).all()
 
 
 def test_stored_searches_are_complete_and_differ_in_the_strategy_alone():

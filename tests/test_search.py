@@ -28,8 +28,21 @@ def test_every_trial_has_the_same_budget(strategy):
         assert set(trial.params) <= set(search.SEARCHED)
 
 
+@pytest.fixture
+def judged(monkeypatch):
+    """The episodes behind each loss that the search looks at, in order."""
+    episodes, validate = [], clients.validate
+
+    def noting(bundle, store, episode_ids, config):
+        episodes.append(list(episode_ids))
+        return validate(bundle, store, episode_ids, config)
+
+    monkeypatch.setattr(clients, "validate", noting)
+    return episodes
+
+
 @pytest.mark.integration
-def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, capsys):
+def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, capsys, judged):
     command = ["search", "--profile", "tiny", "--data", str(recording), "--tasks", "lift,push", "--num-clients", "2"]
     out = tmp_path / "fedavg"
     command += ["--val-fraction", "0.5", "--rollouts", "1", "--search-out", str(out)]
@@ -47,15 +60,15 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     assert found["start"]["n"] == found["best"]["n"] == 2
     assert found["stamp"]["code"] == code_digest(*arms.TRAINED_BY)  # as in a run folder of an experiment
     assert found["first_rollout_seed"] == search.ROLLOUTS_FROM
+    config = from_profile("tiny", tasks="lift,push", num_clients=2, data=str(recording), val_fraction=0.5)
+    store = clients.open_frames(config)
+    held_out, shares = clients.held_out_episodes(store, config), clients.shares(store, config)
+    trial, start, best = held_out[0::2], held_out[1::2], held_out[1::2]
+    assert judged == [trial, start, best, trial, start, best]  # of the first call, and of the one that went on
+    assert trial and not set(trial) & set(best)
+    assert not set(held_out) & {episode for share in shares for episode in share.train_ids}
     assert main([*command, "--trials", "2", "--lr", "0.01"]) == 2
     assert "other settings" in capsys.readouterr().err
-
-
-@pytest.mark.unit
-def test_the_halves_of_the_validation_episodes_share_none(store):
-    config = from_profile("tiny", val_fraction=0.5)
-    held_out = clients.held_out_episodes(store, config)
-    assert not set(held_out[0::2]) & set(held_out[1::2]) and len(held_out) >= 2
 
 
 @pytest.mark.integration
