@@ -6,8 +6,11 @@
       arrays.safetensors          the global arrays, unrounded
       strategy.safetensors        momentum, second moments or control variates, as far as the strategy has any
       clients.safetensors         what clients keep from round to round, where the engine can give it
+
+Each file carries the SHA-256 of its arrays: safetensors itself notices a file that was cut off, but no flipped bit.
 """
 
+import logging
 import os
 import re
 import shutil
@@ -16,12 +19,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
-from fedvla_lib.params import Arrays
+from fedvla_lib.params import Arrays, ParameterError, check_digest, digest
 
+logger = logging.getLogger(__name__)
 KEPT = 2  # rounds: the last, and one before it should the disk have failed under the last
+HASH = "sha256"  # in the header of a file
 PARTS = ("arrays", "strategy", "clients")
 NAME = re.compile(r"round_(\d+)")
 
@@ -58,7 +63,8 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
         scratch.mkdir(parents=True)
         for part in PARTS:
             with writing(folder / f"{part}.safetensors"):
-                save_file(getattr(checkpoint, part), scratch / f"{part}.safetensors")
+                arrays = getattr(checkpoint, part)
+                save_file(arrays, scratch / f"{part}.safetensors", metadata={HASH: digest(arrays)})
         shutil.rmtree(folder, ignore_errors=True)
         os.replace(scratch, folder)
     finally:
@@ -68,19 +74,28 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(root: Path) -> Checkpoint:
-    """Return the last checkpoint of a run folder.
+    """Return the last checkpoint of a run folder that is whole, and warn of a later one that is damaged.
 
     Raises:
-        ValueError: there is none, or it is damaged.
+        ValueError: there is none.
     """
-    if not (rounds := _rounds(root)):
+    if not (rounds := sorted(_rounds(root), reverse=True)):
         raise ValueError(f"{root} has no checkpoint: no round of it was completed, so start it anew")
-    folder = root / "checkpoints" / f"round_{max(rounds)}"
-    try:
-        parts = {part: load_file(folder / f"{part}.safetensors") for part in PARTS}
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{folder} is damaged ({error}): remove it to go on from the round before") from error
-    return Checkpoint(max(rounds), **parts)
+    for number in rounds:
+        folder = root / "checkpoints" / f"round_{number}"
+        try:
+            return Checkpoint(number, **{part: _read(folder / f"{part}.safetensors") for part in PARTS})
+        except (SafetensorError, OSError, ParameterError) as error:
+            damage = f"{folder} is damaged ({error})"
+            logger.warning("%s: looking for the round before", damage)
+    raise ValueError(f"{damage}, and no checkpoint before it is whole: start the run anew")
+
+
+def _read(file: Path) -> Arrays:
+    with safe_open(file, framework="numpy") as content:
+        arrays = {name: content.get_tensor(name) for name in content.keys()}
+        check_digest(arrays, (content.metadata() or {}).get(HASH, ""))
+    return arrays
 
 
 def flat(tree: Mapping[str, Arrays]) -> Arrays:

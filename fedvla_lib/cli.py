@@ -1,6 +1,7 @@
 """`fedvla ...`: thin shells around the library; each command parses, calls and prints.
 
-Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130.
+Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130;
+`kill` and a terminal that is closed count as Ctrl-C.
 Heavy packages are imported inside the commands, so that help and settings answer at once.
 """
 
@@ -11,8 +12,10 @@ import os
 import re
 import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -26,6 +29,7 @@ DOWN = 3  # as service managers report a service that is not running
 DAMAGED = 1  # something was found, and not all of it is sound
 LOCAL = "local"  # who acts and is measured where there is no federation
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # by kill, by the terminal
 
 
 class _Parser(argparse.ArgumentParser):
@@ -39,7 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     options = build_parser().parse_args(argv)
     try:
-        return options.handler(options) or 0
+        with _ended_as_by_ctrl_c():
+            return options.handler(options) or 0
     except KeyboardInterrupt:
         print(f"\ninterrupted: {options.kept}", file=sys.stderr)
         return INTERRUPTED
@@ -48,6 +53,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print(f"fedvla {options.command}: {_one_line(error)}", file=sys.stderr)
         return FAILED
+
+
+@contextmanager
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Meanwhile a command that is told to end stops what it has started. What is ignored stays so, as under nohup."""
+    on_main_thread = threading.current_thread() is threading.main_thread()  # only there may signals be handled
+    signs = [sign for sign in ENDINGS if on_main_thread and signal.getsignal(sign) is signal.SIG_DFL]
+    for sign in signs:
+        signal.signal(sign, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for sign in signs:
+            signal.signal(sign, signal.SIG_DFL)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -303,12 +322,13 @@ def config(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train one policy, centrally or as one client alone, into a run folder."""
-    from fedvla_lib.run_folder import RunFolder, read_config, read_stamp, start, write_json
+    from fedvla_lib.run_folder import RunFolder, hold, read_config, read_stamp, start, write_json
 
     if options.resume:
-        root = options.resume
-        _train_into(RunFolder(root), read_config(root), options)
-        write_json(root / "stamp.json", {**read_stamp(root), "status": "completed", "resumed": True})
+        root, config = options.resume, read_config(options.resume)
+        with hold(root):
+            _train_into(RunFolder(root), config, options)
+            write_json(root / "stamp.json", {**read_stamp(root), "status": "completed", "resumed": True})
         return
     chosen = settings(options)
     with start(chosen, engine="local") as folder:
@@ -388,7 +408,6 @@ def deploy(options: argparse.Namespace) -> None:
     """Run a federation on processes of this machine and print what was measured of the global model."""
     from fedvla_lib.deploy import run_deployed
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was started is stopped here too
     data = options.node_data or []
     _print_rounds(run_deployed(settings(options), tls=options.tls, auth=options.auth, data=data))
 
@@ -399,7 +418,6 @@ def standing_superlink(options: argparse.Namespace) -> int:
 
     if not os.environ.get("FLWR_HOME"):
         raise ValueError("FLWR_HOME is not set: `. flower/env.sh` first, so that Flower settings of your own stay")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was started is stopped here too
     home = Path(os.environ["FLWR_HOME"])
     if options.action in ("status", "last"):
         asked, otherwise = {"status": (standing.status, DOWN), "last": (standing.last, FAILED)}[options.action]

@@ -10,6 +10,7 @@
       evaluate/round_3/client_1/  rollout_<timestamp>.mp4
 
 Whole files appear by rename, events by one append each, so a run that is killed leaves only complete things.
+Who writes to a run holds a lock in its folder, which the system releases however that process ends.
 """
 
 import hashlib
@@ -29,11 +30,14 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from filelock import FileLock, Timeout
 
 from fedvla_lib.config import Config, check
 
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
 GLOBAL = "global"
+LOCK = ".lock"
+PATIENCE_S = 1.0  # with a lock that another process may hold only to see whether it is free
 PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
 
 
@@ -67,27 +71,56 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
     """Make ``<config.out>/<YYYYmmdd_HHMMSS>/``, or take ``config.resume``, yield it, and stamp how the run ended.
 
     Raises:
-        ValueError: the folder cannot be written, or what is to be resumed is no such run.
+        ValueError: the folder cannot be written, or what is to be resumed is no such run, or is still going on.
     """
-    stamp, began = first_stamp(config, engine), time.perf_counter()
-    if config.resume:
-        run = RunFolder(Path(config.resume))
-        _check_resumable(run.root, config)
-        stamp["resumed"] = [*read_stamp(run.root).get("resumed", []), stamp["started"]]
-        stamp["started"] = read_stamp(run.root)["started"]
-    else:
-        run = RunFolder(_make_folder(Path(config.out)))
-        write_json(run.root / "config.json", asdict(config))
-    write_json(run.root / "stamp.json", stamp)
-    status = "interrupted"
+    began = time.perf_counter()
+    root = _existing(Path(config.resume)) if config.resume else _make_folder(Path(config.out))
+    with hold(root):
+        stamp = first_stamp(config, engine)
+        if config.resume:
+            earlier = _resumable(root, config)
+            stamp |= {"started": earlier["started"], "resumed": [*earlier.get("resumed", []), stamp["started"]]}
+        else:
+            write_json(root / "config.json", asdict(config))
+        write_json(root / "stamp.json", stamp)
+        status = "interrupted"
+        try:
+            yield RunFolder(root)
+            status = "completed"
+        except Exception as error:
+            status = f"failed: {type(error).__name__}: {error}"
+            raise
+        finally:
+            write_json(root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
+
+
+@contextmanager
+def hold(root: Path) -> Iterator[None]:
+    """Be the one process that writes to a run folder.
+
+    Raises:
+        ValueError: another one does.
+    """
+    lock = FileLock(root / LOCK, timeout=PATIENCE_S)
     try:
-        yield run
-        status = "completed"
-    except Exception as error:
-        status = f"failed: {type(error).__name__}: {error}"
-        raise
+        lock.acquire()
+    except Timeout as error:
+        raise ValueError(f"{root} is in use: another process still writes to it") from error
+    try:
+        yield
     finally:
-        write_json(run.root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
+        lock.release()
+
+
+def is_held(root: Path) -> bool:
+    """Whether a process writes to a run, as far as can be seen: who may not write there cannot try the lock."""
+    if not (root / LOCK).is_file():  # of an older version, or never started
+        return False
+    try:
+        with FileLock(root / LOCK, timeout=PATIENCE_S / 5):
+            return False
+    except (Timeout, OSError):
+        return True
 
 
 def forget_after(root: Path, round_number: int) -> None:
@@ -99,16 +132,22 @@ def forget_after(root: Path, round_number: int) -> None:
             shutil.rmtree(folder)
 
 
-def _check_resumable(root: Path, config: Config) -> None:
+def _existing(root: Path) -> Path:
     if not (root / "stamp.json").is_file():
         raise ValueError(f"resume={str(root)!r} is not a run folder: it has no stamp.json")
-    if read_stamp(root)["status"] == "completed":
+    return root
+
+
+def _resumable(root: Path, config: Config) -> dict[str, Any]:
+    """Return the stamp of a run that these settings can go on with."""
+    stamp, theirs = read_stamp(root), read_config(root)
+    if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to go on with")
-    theirs = read_config(root)
     if config_hash(theirs) != config_hash(config):
         other = [name for name, value in asdict(theirs).items() if value != getattr(config, name)]
         changed = sorted(set(other) - {"out", "num_threads", "resume"})
         raise ValueError(f"resume={str(root)!r} was run with another {changed[0].replace('_', '-')}: its settings stay")
+    return stamp
 
 
 def read_config(root: Path) -> Config:
@@ -117,8 +156,15 @@ def read_config(root: Path) -> Config:
 
 
 def read_stamp(root: Path) -> dict[str, Any]:
-    """Return the stamp of a run: commit, versions, hardware, status, wall time."""
-    return json.loads((Path(root) / "stamp.json").read_text())
+    """Return the stamp of a run: commit, versions, hardware, status, wall time.
+
+    A process that was killed left ``running`` in the file. Where none writes to the run any more, that is returned as
+    ``interrupted``.
+    """
+    stamp = json.loads((Path(root) / "stamp.json").read_text())
+    if stamp["status"] == "running" and not is_held(Path(root)):
+        stamp["status"] = "interrupted"
+    return stamp
 
 
 def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:

@@ -4,7 +4,7 @@
 
 These are the documented commands, wrapped because four of their habits trip a small machine: the SuperLink that
 `flwr run` starts by itself gives up after 15 s, a client asks for two cores, a failed run still exits with 0, and Ray,
-which runs the clients, allows a helper process of its own 15 s to start.
+which runs the clients, gives up if its own processes take long to start.
 """
 
 import json
@@ -34,7 +34,9 @@ from fedvla_lib.credentials import ServerFiles
 STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
 STATUS_TRIES, POLL_S = 6, 5.0
 COMPLETED = "finished:completed"
-RUNTIME_TRIES = 3  # Ray's 15 s are fixed in its code; a busy machine misses them, seldom twice
+# Ray 2.55 gives its server and its raylet 30 s each to come up, and each of the raylet's helpers 15 s. All of that is
+# fixed in its code; a busy machine misses it, seldom twice.
+RUNTIME_TRIES = 3
 NOT_STARTED = "Simulation Runtime crashed"  # what Flower says if Ray did not come up, before any client was asked
 FIRST_ERROR = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
 OFFLINE = {  # Flower and Ray ask the network nothing

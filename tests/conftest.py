@@ -1,7 +1,10 @@
 """What all tests share: a quiet, offline, single-threaded process, its own cache, and one small recording."""
 
+import json
 import os
+import shutil
 import signal
+import time
 
 # Before the first import of torch, MuJoCo or the hub's client: each reads its variables once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -23,8 +26,59 @@ IMAGE_SIZE = 64
 
 
 def heed_interrupts() -> None:
-    """For a child process: what a shell starts in the background inherits that Ctrl-C is ignored."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """For a child process: what a shell starts in the background, or nohup, inherits that these are ignored."""
+    for sign in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(sign, signal.SIG_DFL)
+
+
+def wait_for_interrupted(root: Path) -> None:
+    """Return once a run whose server was ended reads so: that server is no child of this process, and takes a moment.
+
+    Nobody was left to say so in the stamp itself.
+    """
+    from fedvla_lib import run_folder
+
+    deadline = time.monotonic() + 30
+    while (status := run_folder.read_stamp(root)["status"]) == "running" and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert status == "interrupted" and json.loads((root / "stamp.json").read_text())["status"] == "running"
+
+
+@pytest.fixture
+def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flower's engines run the ClientApp of `faulty.py` in place of the library's."""
+    from fedvla_lib import superlink
+
+    stage = superlink.stage_app
+
+    def stage_faulty(folder: Path) -> Path:
+        app = stage(folder)
+        shutil.copy(Path(__file__).with_name("faulty.py"), app)
+        project = app / "pyproject.toml"
+        told = project.read_text().replace("fedvla_lib.client_app:app", "faulty:app")
+        project.write_text(told.replace("fab-include = [", 'fab-include = ["faulty.py", '))
+        return app
+
+    monkeypatch.setattr(superlink, "stage_app", stage_faulty)
+
+
+def assert_faults_were_survived(root: Path, config) -> None:
+    """A run of the faulty app left out what was wrong, by name and reason, and ended as on the inline engine."""
+    import numpy as np
+    from faulty import app
+    from safetensors.numpy import load_file
+
+    from fedvla_lib import engine, run_folder
+
+    rejected, trained = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train"))
+    found = rejected[["round", "who", "to", "reason"]].values.tolist()
+    assert found == [[1, "client_0", "train", "error"], [2, "client_1", "train", "non-finite"]]
+    assert "no space left on device" in rejected.detail[0]
+    everybody = {f"client_{k}" for k in range(config.num_clients)}
+    assert trained.groupby("round").who.agg(set).tolist() == [everybody - {"client_0"}, everybody - {"client_1"}]
+    inline = engine.run_inline(config, clients_app=app, progress=False)
+    left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
+    assert left.keys() == right.keys() and max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
 
 
 @pytest.fixture(scope="session", autouse=True)

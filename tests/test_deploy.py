@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import IMAGE_SIZE, heed_interrupts
+from conftest import IMAGE_SIZE, assert_faults_were_survived, heed_interrupts
 from cryptography import x509
 from flwr.app import RecordDict
 from safetensors.numpy import load_file
@@ -122,6 +122,11 @@ def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tm
             link.ask("list", superlink.CONNECTION)
 
 
+def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deployment_too(standing, tiny, faulty):
+    deploy.submit(standing, tiny, 540)
+    assert_faults_were_survived(max(superlink.run_folders(tiny)), tiny)
+
+
 def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
     """Ended without warning after round 1, and started again with its key when a round has gone on without it."""
     config = replace(tiny, num_server_rounds=5, local_steps=2)
@@ -186,6 +191,7 @@ def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_end
     assert "round 1, client_1, train: loss" in said
     assert superlink.is_free(int(port)) and not left_over(port)
     (root,) = superlink.run_folders(config)
+    assert run_folder.read_stamp(root)["status"] == "interrupted"
     assert load_file(root / "global_model/round_1/model.safetensors")
     assert set(run_folder.read_metrics(root, "train").query("round == 1").who) == {"client_0", "client_1"}
 

@@ -13,6 +13,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from conftest import assert_faults_were_survived
 from flwr.app import RecordDict
 from flwr.cli.build import build_fab_from_disk
 from flwr.cli.config_utils import load_and_validate
@@ -75,6 +76,11 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     ledgers = [run_folder.read_metrics(one, "replies").query("to == 'train'") for one in (root, inline)]
     columns = ["round", "good", "sent_bytes", "received_bytes"]
     np.testing.assert_allclose(*(ledger[columns].astype(float) for ledger in ledgers), rtol=1e-4)
+
+
+def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_the_simulation_too(tiny, faulty):
+    config = replace(tiny, num_server_rounds=2, client_rollouts=0, fraction_evaluate=0.0)
+    assert_faults_were_survived(superlink.run_simulation(config, timeout_s=540), config)
 
 
 def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsys):

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from conftest import heed_interrupts
+from conftest import heed_interrupts, wait_for_interrupted
 from safetensors.numpy import load_file, save_file
 
 from fedvla_lib import checkpoint, engine, run_folder, server_app, superlink
@@ -56,12 +55,28 @@ def start_until(config, round_number, engine_name="inline"):
 def start_and_kill(config, round_number, engine_name="inline"):
     """End everything without warning while clients train in a round, as in a power cut; return the run folder."""
     process, root = start_until(config, round_number, engine_name)
+    assert run_folder.read_stamp(root)["status"] == "running"
     for one in [*psutil.Process(process.pid).children(recursive=True), process]:
         with contextlib.suppress(psutil.NoSuchProcess):
             one.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    assert run_folder.read_stamp(root)["status"] == "running"  # nobody was left to say otherwise
+    wait_for_interrupted(root)
     return root
+
+
+def start_kill_and_damage(config, round_number):
+    """As if the disk had failed under the last checkpoint: one bit of it is not what was written."""
+    root = start_and_kill(config, round_number)
+    last = max((root / "checkpoints").glob("round_*"), key=lambda folder: int(folder.name.removeprefix("round_")))
+    flip(last / "arrays.safetensors", -1)
+    return root
+
+
+def flip(file, position):
+    """Turn one bit of a file."""
+    content = bytearray(file.read_bytes())
+    content[position] ^= 1
+    file.write_bytes(content)
 
 
 def start_and_interrupt(config, round_number):
@@ -103,14 +118,16 @@ def assert_same_bits(left, right):
         ({"strategy": "fedavg"}, start_and_fill_the_disk),
         (KEEPING, start_and_kill),
         ({"strategy": "fedavgm"}, start_and_interrupt),
+        ({"strategy": "fedadam"}, start_kill_and_damage),
     ],
-    ids=["full disk", "killed", "interrupted"],
+    ids=["full disk", "killed", "interrupted", "damaged"],
 )
-def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end):
+def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end, caplog):
     config = replace(tiny, **settings)
     whole = engine.run_inline(config, progress=False)
     root = start_and_end(replace(config, out=config.out + "_ended"), 3)
     assert main(["run", "--resume", str(root)]) == 0
+    assert (f"{root}/checkpoints/round_" in caplog.text) == (start_and_end is start_kill_and_damage)
     assert_same_bits(last_model(root), last_model(whole))
     assert run_folder.read_stamp(root)["status"] == "completed" and run_folder.read_stamp(root)["resumed"]
     for kind in ("train", "evaluate", "drift", "data"):
@@ -147,7 +164,7 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
     for folder in (done / "checkpoints").glob("round_*"):
         (folder / "arrays.safetensors").write_bytes(b"half of it")
     assert main(["run", "--resume", str(done)]) == 2
-    assert "is damaged" in capsys.readouterr().err
+    assert "no checkpoint before it is whole" in capsys.readouterr().err
     assert json.loads((done / "stamp.json").read_text())["status"].startswith("failed")
 
 
@@ -164,18 +181,6 @@ def test_an_engine_that_cannot_reach_what_clients_keep_says_so_instead_of_resumi
 
 
 @pytest.mark.unit
-def test_a_damaged_checkpoint_is_named_and_once_removed_the_one_before_is_taken(tmp_path):
-    for number in (1, 2):
-        checkpoint.save(tmp_path, Checkpoint(number, {"w": np.ones(3, np.float32)}, {}, {}))
-    newest = tmp_path / "checkpoints" / "round_2"
-    (newest / "arrays.safetensors").write_bytes(b"half of it")
-    with pytest.raises(ValueError, match=f"{newest} is damaged .*remove it to go on from the round before"):
-        checkpoint.load(tmp_path)
-    shutil.rmtree(newest)
-    assert checkpoint.load(tmp_path).round == 1
-
-
-@pytest.mark.unit
 def test_a_checkpoint_is_whole_or_absent_and_only_the_last_two_stay(tmp_path, monkeypatch):
     arrays = {"w": np.arange(3, dtype=np.float32), "v": np.float64(2.0) * np.ones((2, 2))}
     for number in range(4):
@@ -185,15 +190,51 @@ def test_a_checkpoint_is_whole_or_absent_and_only_the_last_two_stay(tmp_path, mo
     assert found.round == 3 and found.arrays["v"].dtype == np.float64
     assert checkpoint.nested(found.clients)["1:control"]["w"].tolist() == [0, 1, 2]
 
-    def full(content, path):
+    def full(content, path, **options):
         if path.name.startswith("clients"):
             raise OSError(28, "No space left on device")
-        save_file(content, path)
+        save_file(content, path, **options)
 
     monkeypatch.setattr(checkpoint, "save_file", full)
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, Checkpoint(4, arrays, {}, {}))
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["round_2", "round_3"]
+
+
+DAMAGES = {
+    "cut off": lambda file: os.truncate(file, file.stat().st_size // 2),
+    "empty": lambda file: os.truncate(file, 0),
+    "missing": Path.unlink,
+    "another's": lambda file: save_file({"w": np.zeros(3, np.float32)}, file),
+}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("part", checkpoint.PARTS)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(tmp_path, part, damage, caplog):
+    for number in (1, 2):
+        arrays = {"w": np.full(3, number, np.float32)}
+        checkpoint.save(tmp_path, Checkpoint(number, arrays, arrays, arrays))
+    DAMAGES[damage](tmp_path / f"checkpoints/round_2/{part}.safetensors")
+    found = checkpoint.load(tmp_path)
+    assert found.round == 1 and getattr(found, part)["w"].tolist() == [1, 1, 1]
+    assert f"{tmp_path}/checkpoints/round_2 is damaged" in caplog.text and "round_1" not in caplog.text
+    DAMAGES[damage](tmp_path / f"checkpoints/round_1/{part}.safetensors")
+    with pytest.raises(ValueError, match="round_1 is damaged .* no checkpoint before it is whole"):
+        checkpoint.load(tmp_path)
+
+
+@pytest.mark.unit
+def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
+    checkpoint.save(tmp_path, Checkpoint(1, {"w": np.arange(5, dtype=np.float32)}, {}, {}))
+    file = tmp_path / "checkpoints/round_1/arrays.safetensors"
+    for position in range(file.stat().st_size):
+        flip(file, position)
+        with pytest.raises(ValueError, match="round_1 is damaged"):
+            checkpoint.load(tmp_path)
+        flip(file, position)
+    assert checkpoint.load(tmp_path).round == 1
 
 
 FULL = """

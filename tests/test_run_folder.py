@@ -4,6 +4,8 @@ import contextlib
 import json
 import os
 import re
+import subprocess
+import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -89,6 +91,38 @@ def test_the_stamp_tells_how_a_run_ended(tmp_path, error, status):
     assert run_folder.read_stamp(run.root)["status"] == status
 
 
+WRITING = """
+import sys, time
+from fedvla_lib import run_folder
+from fedvla_lib.config import from_profile
+with run_folder.start(from_profile("tiny", out=sys.argv[1]), engine="inline") as run:
+    print(run.root, flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_run_is_going_on_as_long_as_its_process_lives(tmp_path):
+    """Nobody else may go on with it meanwhile; killed, it reads as interrupted, and may be gone on with."""
+    process = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    root = Path(process.stdout.readline().strip())
+    config, stamp = from_profile("tiny", out=str(tmp_path), resume=str(root)), (root / "stamp.json").read_text()
+    assert run_folder.read_stamp(root)["status"] == "running"
+    with pytest.raises(ValueError, match=f"{root} is in use: another process still writes to it"):
+        make(config)
+    assert (root / "stamp.json").read_text() == stamp
+    process.kill()
+    process.communicate()
+    assert (root / "stamp.json").read_text() == stamp  # nobody was left to say otherwise
+    assert run_folder.read_stamp(root)["status"] == "interrupted"
+    assert make(config) == root and run_folder.read_stamp(root)["status"] == "completed"
+
+
+def test_a_stamp_of_a_run_before_there_were_locks_is_read_too(tmp_path):
+    run_folder.write_json(tmp_path / "stamp.json", {"status": "running"})
+    assert run_folder.read_stamp(tmp_path)["status"] == "interrupted"
+    assert not (tmp_path / run_folder.LOCK).exists()
+
+
 def test_an_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ValueError, match="cannot make the run folder .*file.*give a writable folder"):
@@ -122,7 +156,7 @@ def test_a_read_only_place_is_named_and_left_as_it_is(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt), run_folder.start(config, engine="inline") as run:
             run.log(1, "global", "evaluate", {"loss": 1.0})
             raise KeyboardInterrupt
-        before = {path: path.read_bytes() for path in place.rglob("*.json*")}
+        before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
         with read_only(place):
             with pytest.raises(ValueError, match=f"cannot make the run folder {place}/outputs/.*Permission denied"):
                 make(config)

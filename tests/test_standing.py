@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,7 +14,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from conftest import heed_interrupts
+import torch
+from conftest import heed_interrupts, wait_for_interrupted
 
 from fedvla_lib import client_app, run_folder, standing, superlink
 from fedvla_lib.cli import main
@@ -33,8 +36,9 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         eval_rollouts=0, client_rollouts=0, num_threads=1, out=str(tmp_path / "outputs"),
     )  # fmt: skip
     assert main(["superlink", "status"]) == 3
-    interrupt_while_starting(home)
-    assert main(["superlink", "status"]) == 3 and not processes_of(home)
+    for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        interrupt_while_starting(home, sign)
+        assert main(["superlink", "status"]) == 3 and not processes_of(home)
     try:
         assert main(["superlink", "up"]) == 0
         assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
@@ -45,7 +49,11 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         assert run_folder.read_config(root) == tiny
         assert len(run_folder.read_metrics(root, "train")) == 2  # half of three clients
         assert main(["superlink", "last"]) == 0 and "is finished:completed" in capsys.readouterr().out
-        run_app("local-simulation", replace(tiny, data="nowhere/at/all"), "num-supernodes=3")
+        if torch.cuda.is_available():
+            run_app("local-simulation", replace(tiny, data="nowhere/at/all"), "num-supernodes=3")
+        else:
+            assert "ActorPool is empty" in run_app("local-simulation-gpu", tiny, "num-supernodes=3")
+            wait_for_interrupted(max(superlink.run_folders(tiny)))
         assert main(["superlink", "last"]) == 2 and "is finished:failed" in capsys.readouterr().out
     finally:
         assert main(["superlink", "down"]) == 0
@@ -56,7 +64,7 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
 def run_app(connection, config, federation):
     """Call `flwr run` with settings as the README writes them: on the command line, those that differ.
 
-    It exits with 0 whatever became of the run.
+    Return what it says. It exits with 0 whatever became of the run.
     """
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
@@ -66,18 +74,20 @@ def run_app(connection, config, federation):
     environment = superlink.flower_environment(Path(os.environ["FLWR_HOME"]))
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
     assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
-def interrupt_while_starting(home):
-    """Start `fedvla superlink up` and press Ctrl-C before it answers: the signal goes to the whole group."""
+def interrupt_while_starting(home, sign):
+    """Start `fedvla superlink up` and end it before it answers, as Ctrl-C, `kill` or a closed terminal does."""
     command = [sys.executable, "-m", "fedvla_lib.cli", "superlink", "up"]
     options = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "preexec_fn": heed_interrupts}
     process = subprocess.Popen(command, **options)
     log = home / "superlink.log"
+    log.unlink(missing_ok=True)
     while not (log.exists() and log.stat().st_size):  # Flower has begun to say something
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, sign)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 130 and said.strip() == "interrupted: nothing was started", said
 
@@ -123,6 +133,30 @@ def test_connections_of_ones_own_stay_and_one_in_the_way_is_named(tmp_path):
 )
 def test_a_client_computes_on_the_card_that_is_reserved_for_it(device, cards, chosen):
     assert client_app.on_reserved_card(from_profile("tiny", device=device), cards).device == chosen
+
+
+@pytest.mark.unit
+def test_what_a_reader_types_names_connections_and_settings_that_there_are():
+    pages = [(ROOT / name).read_text() for name in ("README.md", "book/deployment.md")]
+    told = [line for page in pages for line in re.findall(r"flwr run \. [^\n`]*", page)]
+    known = {*tomllib.loads(standing.CONNECTIONS.read_text())["superlink"], "labs"}  # the last is the page's own
+    assert "[superlink.labs]" in pages[1] and {line.split()[3] for line in told} == known - {"default"}
+    overrides = re.findall(r"""--run-config (?:"([^"]+)"|'([^']+)')""", "\n".join(pages))
+    given = [word.split("=") for pair in overrides for word in "".join(pair).split()]
+    usual = to_run_config(from_profile("tiny"))
+    assert len(given) >= 5 and all(type(json.loads(value)) is type(usual[name]) for name, value in given)
+
+
+@pytest.mark.unit
+def test_a_port_that_another_program_uses_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FLWR_HOME", str(tmp_path / "flwr"))
+    with socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        other.bind(("127.0.0.1", 9493))
+        other.listen()
+        assert main(["superlink", "up"]) == 2
+    assert "port 9493 is used by another program" in capsys.readouterr().err
+    assert not (tmp_path / "flwr").exists()
 
 
 @pytest.mark.unit

@@ -1,0 +1,28 @@
+"""A ClientApp that fails on the way: in round 1 client 0 raises, in round 2 client 1 sends what is no number.
+
+Tests put this file into the app that Flower's engines run, and pass its app to the inline engine.
+"""
+
+import numpy as np
+
+from fedvla_lib import client_app, wire
+from fedvla_lib.params import digest
+
+
+def fault(message, context, call_next):
+    """Around a handler; the hash is that of what is sent."""
+    reply, who = call_next(message, context), context.node_config[wire.PARTITION]
+    if message.metadata.message_type != "train":
+        return reply
+    match message.content[wire.CONFIG][wire.ROUND], who:
+        case 1, 0:
+            raise OSError("no space left on device")
+        case 2, 1:
+            trained = wire.unpack_arrays(reply.content[wire.ARRAYS])
+            arrays = {name: array * np.float32("nan") for name, array in trained.items()}
+            reply.content[wire.ARRAYS] = wire.pack_arrays(arrays)
+            reply.content[wire.NOTE] = wire.note(sha256=digest(arrays))
+    return reply
+
+
+app = client_app.build(mods=[fault])
