@@ -1,5 +1,6 @@
 """The SuperLink that stays up: started, found, used by Flower's own command, and stopped with all it started."""
 
+import contextlib
 import json
 import os
 import re
@@ -43,16 +44,16 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         assert main(["superlink", "up"]) == 0
         assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
         assert main(["superlink", "last"]) == 2 and "has had no run yet" in capsys.readouterr().err
-        run_app("local-simulation", tiny, "num-supernodes=3")
+        run_app("local-simulation", tiny, "--federation-config", "num-supernodes=3 client-resources-num-cpus=1")
         (root,) = superlink.run_folders(tiny)
         assert run_folder.read_stamp(root)["status"] == "completed"
         assert run_folder.read_config(root) == tiny
         assert len(run_folder.read_metrics(root, "train")) == 2  # half of three clients
         assert main(["superlink", "last"]) == 0 and "is finished:completed" in capsys.readouterr().out
         if torch.cuda.is_available():
-            run_app("local-simulation", replace(tiny, data="nowhere/at/all"), "num-supernodes=3")
+            run_app("local-simulation", replace(tiny, data="nowhere/at/all"))
         else:
-            assert "ActorPool is empty" in run_app("local-simulation-gpu", tiny, "num-supernodes=3")
+            assert "ActorPool is empty" in run_app("local-simulation-gpu", tiny)
             wait_for_interrupted(max(superlink.run_folders(tiny)))
         assert main(["superlink", "last"]) == 2 and "is finished:failed" in capsys.readouterr().out
     finally:
@@ -61,7 +62,7 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
     assert (ROOT / "pyproject.toml").read_bytes() == before
 
 
-def run_app(connection, config, federation):
+def run_app(connection, config, *options):
     """Call `flwr run` with settings as the README writes them: on the command line, those that differ.
 
     Return what it says. It exits with 0 whatever became of the run.
@@ -69,8 +70,7 @@ def run_app(connection, config, federation):
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
     words = " ".join(f"{name}={json.dumps(value)}" for name, value in told.items())
-    command = [superlink.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words]
-    command += ["--federation-config", federation]
+    command = [superlink.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words, *options]
     environment = superlink.flower_environment(Path(os.environ["FLWR_HOME"]))
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -151,9 +151,9 @@ def test_what_a_reader_types_names_connections_and_settings_that_there_are():
 def test_a_port_that_another_program_uses_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FLWR_HOME", str(tmp_path / "flwr"))
     with socket.socket() as other:
-        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        other.bind(("127.0.0.1", 9493))
-        other.listen()
+        with contextlib.suppress(OSError):  # if another program uses it indeed
+            other.bind(("127.0.0.1", 9493))
+            other.listen()
         assert main(["superlink", "up"]) == 2
     assert "port 9493 is used by another program" in capsys.readouterr().err
     assert not (tmp_path / "flwr").exists()
