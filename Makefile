@@ -3,13 +3,13 @@
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
-# make check-zip   every chapter as a reader of the zip runs it
+# make check-zip   every chapter as a reader of the zip runs it (make test does it too)
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
 # Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
-# share the test files; every one computes on one thread and takes 2 GB).
+# share the test files, then the chapters; every one computes on one thread and takes 2 GB).
 .DEFAULT_GOAL := help
 .PHONY: help env book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
@@ -96,7 +96,7 @@ zip: $(STAMP)
 
 # Every chapter from that zip, at the profile tiny: an empty folder, and the wheel in place of the source.
 check-zip: $(STAMP)
-	$(BIN)/python book/check_zip.py
+	$(BIN)/python book/check_zip.py -n $(TEST_WORKERS) --dist loadfile
 
 # Needs the executed chapters of `make book`, and the system's Chromium.
 pdf: $(STAMP)
@@ -112,15 +112,15 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md book/*.md notebooks/*.ipynb
 
-# Coverage counts the tests alone. The chapters then run twice at the tiny profile: as their reader would run them (nbmake) and
-# with injected parameters (papermill); the second copies are what CI renders.
+# Coverage counts the tests alone. The chapters then run twice at the tiny profile: with nbmake as the reader of the zip runs
+# them, from the wheel, and in this folder with injected parameters (papermill); the second copies are what CI renders.
 test: export FEDVLA_PROFILE := tiny
 test: export HF_HUB_OFFLINE := 1
 test: doctor lint
-	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --durations 20 --cov --cov-report term \
+	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
-	$(BIN)/pytest --nbmake --nbmake-timeout 300 --durations 0 --junitxml _build/tests/junit-notebooks.xml notebooks
-	$(BIN)/python book/build_book.py --profile tiny --execute-only
+	$(BIN)/python book/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml $(CURDIR)/_build/tests/junit-notebooks.xml
+	$(BIN)/python book/build_book.py --profile tiny --execute-only --jobs $(TEST_WORKERS)
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \

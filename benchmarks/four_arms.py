@@ -30,9 +30,10 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the runs")
     parser.add_argument("--rollouts", type=int, default=20, help="attempts at each task, for each model and seed")
+    parser.add_argument("--threads", type=int, default=cores(), help="threads that a model computes on")
     chosen = parser.parse_args()
     recording = data.resolve(laptop(chosen.profile))
-    config = laptop(chosen.profile, num_threads=cores(), data=str(recording))
+    config = laptop(chosen.profile, num_threads=chosen.threads, data=str(recording))
     rows = pd.concat([one_seed(config, seed, chosen) for seed in chosen.seeds], ignore_index=True)
     report("four_arms", summary(rows), chosen.out)
 

@@ -17,9 +17,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import library
 import nbformat
@@ -143,8 +148,11 @@ def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
     return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
 
 
-def execute(notebook: Path, folder: Path, profile: str, library: str) -> Chapter:
+def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time: int = 1) -> Chapter:
     """Execute `notebook` at `profile` and put the copy with its results into `folder`.
+
+    Args:
+        at_a_time: how many chapters are executed side by side, for the status page.
 
     Raises:
         BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
@@ -154,7 +162,8 @@ def execute(notebook: Path, folder: Path, profile: str, library: str) -> Chapter
     check_parameters(notebook, parameters)
     where = status.environment(notebook, profile)
     seconds = _execute(notebook, target, parameters)
-    _finish(target, {"key": key, "profile": profile, "seconds": round(seconds, 1), "environment": where})
+    cost = {"seconds": round(seconds, 1), "at_a_time": at_a_time}
+    _finish(target, {"key": key, "profile": profile, **cost, "environment": where})
     return Chapter(notebook.stem, target, key, seconds, reused=False)
 
 
@@ -201,12 +210,13 @@ def _finish(target: Path, stamp: dict[str, object]) -> None:
 
 
 def execute_chapters(
-    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None
+    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None, jobs: int = 1
 ) -> list[Chapter]:
     """Execute the chapters of the contents whose name contains `only` and that changed, saying what each costs.
 
     Args:
         prepare: called with the profile before the first chapter that has to be executed.
+        jobs: how many are executed at a time; each takes longer then than alone.
     """
     library, folder = library_key(root, profile), root / "_build" / profile / "executed"
     notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file() and only in page]
@@ -215,12 +225,42 @@ def execute_chapters(
     chapters = {path: reuse(path, folder, library) for path in notebooks}
     if not all(chapters.values()):
         prepare(profile)
-    for number, path in enumerate(notebooks, start=1):
-        if chapters[path] is None:
-            print(f"[{number}/{len(notebooks)}] {path.stem}, profile {profile} ...", flush=True)
-        chapters[path] = chapters[path] or execute(path, folder, profile, library)
-        print(f"[{number}/{len(notebooks)}] {path.stem}: {_cost(chapters[path])}", flush=True)
+    place = {path: f"[{number}/{len(notebooks)}] {path.stem}" for number, path in enumerate(notebooks, start=1)}
+    order = notebooks if jobs == 1 else notebooks[::-1]  # the last are the longest: none is left when others are done
+    with _workers(jobs) as give:
+        changed = [path for path in order if chapters[path] is None]
+        said = {path: f"{place[path]}, profile {profile} ..." for path in changed}
+        work = {path: give(_announced, said[path], path, folder, profile, library, jobs) for path in changed}
+        for path in order:
+            chapters[path] = chapters[path] or work[path]()
+            print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
+
+
+def _announced(words: str, notebook: Path, *how: Any) -> Chapter:
+    print(words, flush=True)
+    return execute(notebook, *how)
+
+
+def _on_one_thread() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the kernels that this process will start
+
+
+@contextmanager
+def _workers(jobs: int) -> Iterator[Callable[..., Callable[[], Chapter]]]:
+    """Yield a function that takes work and returns what to call for its result.
+
+    One at a time, the work is done here, when its result is asked for. Otherwise it begins at once, in other processes:
+    papermill works in the folder of the notebook, which threads could not do side by side.
+    """
+    if jobs == 1:
+        yield partial
+        return
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _on_one_thread)
+    try:
+        yield lambda *work: pool.submit(*work).result
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def record_data(profile: str) -> None:
@@ -435,10 +475,10 @@ def _undescribed_images(page: Path) -> int:
     return sum(text is None or not text[1] or "_images/" in text[1] for text in texts)
 
 
-def build(root: Path, profile: str, only: str, execute_only: bool) -> Path | None:
+def build(root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1) -> Path | None:
     """Execute what changed and, unless `execute_only`, build the book; return its front page."""
     start = time.monotonic()
-    chapters = execute_chapters(root, profile, only, prepare=record_data)
+    chapters = execute_chapters(root, profile, only, prepare=record_data, jobs=jobs)
     if execute_only:
         print(f"{len(chapters)} chapters executed at profile {profile}", flush=True)
         return None
@@ -479,9 +519,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
+    parser.add_argument("--jobs", default=1, type=int, metavar="N", help="chapters at a time; above 1 only at tiny")
     options = parser.parse_args(argv)
+    if options.jobs < 1 or (options.jobs > 1 and options.profile != "tiny"):
+        parser.error(f"--jobs {options.jobs}: what a chapter costs at {options.profile} is measured one at a time")
     try:
-        front_page = build(ROOT, options.profile, options.only, options.execute_only or bool(options.only))
+        whole = not (options.execute_only or options.only)
+        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs)
     except (ValueError, OSError) as error:
         print(f"the book was not built: {error}", file=sys.stderr)
         return 2

@@ -1,19 +1,21 @@
 """Execute chapters as their readers do who took the zip: unpacked in an empty folder, from the library's wheel.
 
-    python book/check_zip.py            every chapter, at the profile tiny
+    python book/check_zip.py              every chapter, at the profile tiny
     python book/check_zip.py --only 02
+    python book/check_zip.py -n 2         what it does not know itself is for pytest: here, two chapters at a time
 
-The environment is a new one that sees the packages of this one, but not the source of the library. Recordings in the
-cache are used again.
+The environment is a new one that sees the packages of this one, but not the source of the library. pytest --nbmake runs
+in it. Recordings in the cache are used again.
 """
 
 import argparse
 import os
+import shlex
 import subprocess
 import sys
 import sysconfig
 import tempfile
-import time
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from zipfile import ZipFile
@@ -21,7 +23,16 @@ from zipfile import ZipFile
 import make_zip
 import nbformat
 
-WHERE = "import fedvla_lib\n\nprint(fedvla_lib.__file__)"
+CELL_TIMEOUT_S = 300
+# The last cell of each: the kernel is the new environment's, and so is the library that the chapter used.
+FROM_THE_WHEEL = """import sys
+from pathlib import Path
+
+import fedvla_lib
+
+installed = Path(fedvla_lib.__file__).is_relative_to(sys.prefix)
+assert installed and sys.prefix == {prefix!r}, f"{{fedvla_lib.__file__}}, run by {{sys.prefix}}"
+"""
 PROGRAM = "#!{python}\nimport sys\n\nfrom {module} import {attribute}\n\nsys.exit({attribute}())\n"
 
 
@@ -52,52 +63,61 @@ def new_environment(book: Path) -> Path:
     return python
 
 
-def execute(notebook: Path, python: Path) -> float:
-    """Execute a chapter at the profile tiny in its own folder and return the seconds it took.
+def surroundings(python: Path) -> dict[str, str]:
+    """Return the environment variables of a shell in which that Python's environment is the active one.
+
+    Each chapter computes on one thread, so that several can run at a time.
+    """
+    outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    path = f"{python.parent}{os.pathsep}{outside['PATH']}"
+    return {"OMP_NUM_THREADS": "1"} | outside | {"FEDVLA_PROFILE": "tiny", "PATH": path}
+
+
+def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()) -> int:
+    """Execute chapters of an unpacked book with `pytest --nbmake`, each in its own folder, and return its exit status.
+
+    A chapter also fails if its library did not come from the environment of `python`.
+    """
+    for notebook in notebooks:
+        content = nbformat.read(notebook, as_version=4)
+        content.cells.append(nbformat.v4.new_code_cell(FROM_THE_WHEEL.format(prefix=str(python.parents[1]))))
+        nbformat.write(content, notebook)
+    book = python.parents[2]
+    alone = ["-c", os.devnull, "--rootdir", str(book), "-p", "no:cacheprovider"]  # no settings of folders above
+    nbmake = ["--nbmake", "--nbmake-timeout", str(CELL_TIMEOUT_S), "--durations", "0", *options]
+    command = [str(python), "-m", "pytest", *alone, *nbmake, *map(str, notebooks)]
+    return subprocess.run(command, cwd=book, env=surroundings(python), check=False).returncode
+
+
+def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
+    """Execute the chapters whose name contains `only` in an empty folder; return pytest's exit status.
 
     Raises:
-        ValueError: a cell failed, or the library did not come from the new environment.
+        ValueError: there is no such chapter, or the demonstrations could not be recorded.
     """
-    content, began = nbformat.read(notebook, as_version=4), time.monotonic()
-    content.cells.append(nbformat.v4.new_code_cell(WHERE))
-    nbformat.write(content, notebook)
-    outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    environment = outside | {"FEDVLA_PROFILE": "tiny", "PATH": f"{python.parent}{os.pathsep}{outside['PATH']}"}
-    done = notebook.with_name(f"{notebook.stem}.done.ipynb")
-    command = [python, "-m", "papermill", "--kernel", "python3", "--no-progress-bar", notebook.name, done.name]
-    ran = subprocess.run(command, cwd=notebook.parent, env=environment, capture_output=True, text=True, check=False)
-    if ran.returncode:
-        raise ValueError(f"{notebook.stem} from the zip: {' '.join(ran.stderr.split())[-600:]}")
-    file = Path(nbformat.read(done, as_version=4).cells[-1].outputs[0].text.strip())
-    if not file.is_relative_to(python.parents[1]):
-        raise ValueError(f"{notebook.stem} did not use the library of the zip but {file}")
-    return time.monotonic() - began
-
-
-def check(folder: Path, only: str = "") -> dict[str, float]:
-    """Execute the chapters whose name contains `only` in an empty folder; return the seconds of each."""
     book = unpack(make_zip.make(make_zip.ROOT, folder / "fedvla-book.zip"), folder)
     notebooks = [path for path in sorted((book / "notebooks").glob("*.ipynb")) if only in path.stem]
     if not notebooks:
         raise ValueError(f"no chapter of the zip has {only!r} in its name")
-    python, seconds = new_environment(book), {}
-    for notebook in notebooks:
-        seconds[notebook.stem] = execute(notebook, python)
-        print(f"{notebook.stem}: {seconds[notebook.stem]:.0f} s", flush=True)
-    return seconds
+    notebooks.reverse()  # the last are the longest: side by side, none is left when the others are done
+    python = new_environment(book)
+    record = [str(python.parent / "fedvla"), "record", "--profile", "tiny"]  # as the zip's README says
+    if subprocess.run(record, cwd=book, env=surroundings(python), check=False).returncode:
+        raise ValueError(f"{shlex.join(record[1:])} failed in the unpacked book")
+    return execute(notebooks, python, options)
 
 
-def main() -> int:
-    """Check the zip and say what each chapter took."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main(argv: list[str] | None = None) -> int:
+    """Check the zip; pytest says what each chapter took."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("--only", default="", metavar="TEXT", help="the chapters whose name contains TEXT")
+    known, options = parser.parse_known_args(argv)
     try:
         with tempfile.TemporaryDirectory(prefix="fedvla-check-") as folder:
-            check(Path(folder), parser.parse_args().only)
+            return check(Path(folder), known.only, options)
     except (ValueError, OSError) as error:
         print(f"check_zip: {error}", file=sys.stderr)
         return 2
-    return 0
 
 
 if __name__ == "__main__":

@@ -45,7 +45,9 @@ def _chapters(stamps: dict[Path, dict], profile: str) -> str:
         rows.append([f"[](../notebooks/{path.name})", seconds, seed, when])
     total = sum(stamp.get("seconds", 0) for stamp in stamps.values())
     rows.append(["**together**", f"**{total:.0f}**", "", ""])
-    return f"Profile `{profile}`.\n\n" + table(["chapter", "seconds", "seed", "executed (UTC)"], rows)
+    side_by_side = max((stamp.get("at_a_time", 1) for stamp in stamps.values()), default=1)
+    shared = f", {side_by_side} chapters at a time: each took longer than alone" if side_by_side > 1 else ""
+    return f"Profile `{profile}`{shared}.\n\n" + table(["chapter", "seconds", "seed", "executed (UTC)"], rows)
 
 
 def _environments(stamps: dict[Path, dict]) -> str:

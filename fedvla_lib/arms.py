@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from filelock import FileLock
+
 from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
 from fedvla_lib.config import Config, cache_dir, code_digest
@@ -42,10 +44,11 @@ def steps_in_a_row(config: Config) -> int:
 def federated(config: Config, progress: bool = True) -> Path:
     """Return the folder of a completed run with these settings, running it in this process if there is none."""
     out = cache_dir() / "runs" / _key(config)
-    for folder in sorted(out.glob("*/")):
-        if run_folder.read_stamp(folder)["status"] == "completed":
-            return folder
-    return engine.run_inline(replace(config, out=str(out)), progress=progress)
+    with _alone(out):
+        for folder in sorted(out.glob("*/")):
+            if run_folder.read_stamp(folder)["status"] == "completed":
+                return folder
+        return engine.run_inline(replace(config, out=str(out)), progress=progress)
 
 
 def federated_policy(config: Config) -> model.Bundle:
@@ -84,9 +87,16 @@ def _train(config: Config, client: Client, steps: int, progress: bool) -> model.
 def _kept(config: Config, name: str, train: Callable[[], model.Bundle]) -> model.Bundle:
     """Load the arm's model from the cache, or train and keep it."""
     folder = cache_dir() / "arms" / f"{name}-{_key(config)}"
-    if not folder.exists():
-        model.save_policy(train(), folder)
+    with _alone(folder):
+        if not folder.exists():
+            model.save_policy(train(), folder)
     return model.load_policy(replace(config, base=str(folder)))
+
+
+def _alone(kept: Path) -> FileLock:
+    """A lock beside what is kept: of two chapters that want the same model, the second waits and trains nothing."""
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(kept.with_name(f"{kept.name}.lock"))
 
 
 def _everything(config: Config) -> Client:

@@ -81,6 +81,12 @@ def assert_faults_were_survived(root: Path, config) -> None:
     assert left.keys() == right.keys() and max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first: dealt out last, one of them would keep a worker busy that all others wait for."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """An empty cache for this run of the tests, so that nothing on the machine decides what they see."""

@@ -127,12 +127,22 @@ def test_executed_copy_shows_results_but_neither_injection_nor_paths(project):
 
 
 @pytest.mark.integration
-def test_failing_cell_names_chapter_and_error_and_leaves_no_copy(project, capsys):
-    build_book.execute_chapters(project, "tiny")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_failing_cell_names_chapter_and_error_and_leaves_no_copy(project, jobs):
+    """Also where chapters are executed side by side, in other processes."""
+    (chapter,) = build_book.execute_chapters(project, "tiny", jobs=jobs)
+    assert nbformat.read(chapter.executed, as_version=4).metadata["fedvla"]["at_a_time"] == jobs
     write_notebook(project / "notebooks" / "one.ipynb", code="raise KeyError('no such episode')")
     with pytest.raises(BookError, match=r"one.ipynb: KeyError: 'no such episode'"):
-        build_book.execute_chapters(project, "tiny")
+        build_book.execute_chapters(project, "tiny", jobs=jobs)
     assert not (project / "_build" / "tiny" / "executed" / "one.ipynb").exists()
+
+
+@pytest.mark.unit
+def test_chapters_whose_costs_are_printed_are_executed_one_at_a_time(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        build_book.main(["--profile", "laptop", "--jobs", "2"])
+    assert "laptop is measured one at a time" in capsys.readouterr().err
 
 
 @pytest.mark.unit

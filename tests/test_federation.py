@@ -4,6 +4,7 @@ Faults are injected by real ClientApps around the library's own: they let it wor
 """
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,15 @@ def test_of_one_client_a_full_batch_and_one_step_federated_and_centralized_are_a
     assert any(np.abs(federated[name] - start[name]).max() > 1e-5 for name in start)
     for name in start:
         np.testing.assert_allclose(federated[name], centralized[name], rtol=0, atol=1e-6)
+
+
+def test_two_chapters_that_want_the_same_models_at_once_train_them_once(tiny):
+    config = replace(tiny, seed=11, num_clients=1, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
+    with ThreadPoolExecutor(2) as chapters:
+        first, second = chapters.map(arms.federated, [config, config])
+        alone = list(chapters.map(arms.local_only, [config, config], [0, 0]))
+    assert first == second and list(first.parent.glob("*/")) == [first]
+    assert same(*(bundle.shared_arrays() for bundle in alone))
 
 
 def test_two_runs_with_one_seed_agree_bit_for_bit(tiny):

@@ -1,14 +1,19 @@
 """The zip of a release holds what a chapter needs, and its library works where no checkout is."""
 
+import shutil
 from pathlib import Path
 from zipfile import ZipFile
 
 import check_zip
 import make_zip
+import nbformat
 import pytest
+from nbformat.v4 import new_code_cell, new_notebook
 
 pytestmark = pytest.mark.integration
 ROOT = Path(__file__).parents[1]
+KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
+SEES_THE_SOURCE = f"import sys\nsys.path.insert(0, {str(ROOT)!r})"
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +39,17 @@ def test_its_readme_names_what_is_there(unpacked):
     assert wheel.name in text and "requirements.lock" in text and (unpacked / "requirements.lock").is_file()
 
 
-def test_a_chapter_runs_from_the_zip_and_the_wheel(tmp_path):
-    """In an empty folder and a new environment; `make check-zip` does it with every chapter."""
-    assert list(check_zip.check(tmp_path, only="02_partitioning")) == ["02_partitioning"]
+def test_chapters_run_from_the_wheel_and_one_that_does_not_fails(unpacked, tmp_path, capfd):
+    """In an empty folder and a new environment; `make test` does it with every chapter."""
+    book = shutil.copytree(unpacked, tmp_path / "book", ignore=shutil.ignore_patterns("*.ipynb"))
+    python, codes = check_zip.new_environment(book), {"wheel": "import fedvla_lib", "source": SEES_THE_SOURCE}
+    for name, code in codes.items():
+        (chapter := new_notebook(cells=[new_code_cell(code)])).metadata["kernelspec"] = KERNEL
+        nbformat.write(chapter, book / "notebooks" / f"{name}.ipynb")
+    paths = [book / "notebooks" / f"{name}.ipynb" for name in codes]
+    assert check_zip.execute(paths, python) == 1
+    said = capfd.readouterr().out
+    assert "1 failed, 1 passed" in said and f"{ROOT / 'fedvla_lib' / '__init__.py'}, run by " in said
 
 
 def test_the_wheel_holds_the_model_that_labs_start_from(unpacked):
