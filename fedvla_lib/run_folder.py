@@ -162,7 +162,7 @@ def read_stamp(root: Path) -> dict[str, Any]:
     ``interrupted``.
     """
     stamp = json.loads((Path(root) / "stamp.json").read_text())
-    if stamp["status"] == "running" and not is_held(Path(root)):
+    if stamp.get("status") == "running" and not is_held(Path(root)):
         stamp["status"] = "interrupted"
     return stamp
 
