@@ -26,11 +26,13 @@ def measured_in(executed: Path) -> dict[str, float | None]:
     """Return seconds, memory and bytes of an executed chapter; None for what it does not say.
 
     Raises:
-        ValueError: the copy was not made by a build of the book.
+        ValueError: the copy was not made by a build of the book, or not alone.
     """
     notebook = nbformat.read(executed, as_version=4)
     if "fedvla" not in notebook.metadata:
         raise ValueError(f"{executed.name} was not executed by make book")
+    if (together := notebook.metadata["fedvla"].get("at_a_time", 1)) > 1:
+        raise ValueError(f"{executed.name} was executed with {together} at a time: remove it, and run make book first")
     said = [
         output["metadata"][MEASURED]
         for cell in notebook.cells

@@ -82,6 +82,15 @@ def test_a_copy_that_no_build_made_is_refused(tmp_path):
         keep_costs.measured_in(tmp_path / "01_a.ipynb")
 
 
+def test_the_cost_of_chapters_that_ran_side_by_side_is_not_kept(tmp_path):
+    executed(tmp_path, "01_a")
+    notebook = nbformat.read(tmp_path / "01_a.ipynb", as_version=4)
+    notebook.metadata["fedvla"]["at_a_time"] = 2
+    nbformat.write(notebook, tmp_path / "01_a.ipynb")
+    with pytest.raises(ValueError, match="01_a.ipynb was executed with 2 at a time"):
+        keep_costs.measured_in(tmp_path / "01_a.ipynb")
+
+
 def test_the_kept_costs_are_of_the_chapters_that_there_are():
     chapters = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
     files = sorted((ROOT / "book" / "reference" / "costs").glob("*.json"))
