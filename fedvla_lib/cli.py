@@ -142,20 +142,26 @@ def _add_run(commands: Any) -> None:
     parser = _command(commands, "run", run, "run a federation", "the rounds that ended stay in the run folder")
     text = "inline: in this process, in a fixed order; simulation: Flower's runtime, several processes"
     parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
+    _add_resume(parser)
+    _add_settings(parser)
+
+
+def _add_resume(parser: argparse.ArgumentParser) -> None:
     text = "go on with this interrupted run, with its own settings"
     parser.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help=text)
-    _add_settings(parser)
 
 
 def _add_deploy(commands: Any) -> None:
     kept = "every process is stopped; the rounds that ended stay in the run folder"
     text = "run a federation on a SuperLink and SuperNodes of this machine, each a process of its own"
     parser = _command(commands, "deploy", deploy, text, kept)
-    parser.add_argument("--clients", type=int, dest="num_clients", metavar="N", help="the same as --num-clients")
+    text = "the same as --num-clients"
+    parser.add_argument("--clients", type=int, dest="num_clients", default=argparse.SUPPRESS, metavar="N", help=text)
     parser.add_argument("--tls", action="store_true", help="encrypt, with certificates made for the occasion")
     parser.add_argument("--auth", action="store_true", help="let in only nodes whose key is known; needs --tls")
     text = "a client's own data set, in the order of clients; repeat for each (default: parts of --data)"
     parser.add_argument("--node-data", action="append", type=Path, metavar="DIR", help=text)
+    _add_resume(parser)
     _add_settings(parser)
 
 
@@ -387,8 +393,12 @@ def _learner(chosen: Config, client: int | None) -> Any:
 
 def run(options: argparse.Namespace) -> None:
     """Run a federation and print what was measured of the global model, round by round."""
-    chosen = _to_resume(options) if options.resume else settings(options)
-    _print_rounds(_engine(options.engine)(chosen))
+    _print_rounds(_engine(options.engine)(_chosen(options)))
+
+
+def _chosen(options: argparse.Namespace) -> Config:
+    """Return the settings of a new run, or of the one to go on with."""
+    return _to_resume(options) if options.resume else settings(options)
 
 
 def _to_resume(options: argparse.Namespace) -> Config:
@@ -409,7 +419,7 @@ def deploy(options: argparse.Namespace) -> None:
     from fedvla_lib.deploy import run_deployed
 
     data = options.node_data or []
-    _print_rounds(run_deployed(settings(options), tls=options.tls, auth=options.auth, data=data))
+    _print_rounds(run_deployed(_chosen(options), tls=options.tls, auth=options.auth, data=data))
 
 
 def standing_superlink(options: argparse.Namespace) -> int:

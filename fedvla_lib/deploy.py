@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from fedvla_lib import credentials, run_folder, superlink
 from fedvla_lib.config import Config, check
@@ -151,7 +152,7 @@ def run_deployed(
         with deployment(folder, config.num_clients, tls=tls, auth=auth, data=data) as here:
             say(f"{config.num_clients} SuperNodes joined the SuperLink at 127.0.0.1:{here.link.port}")
             submit(here, config, timeout_s, news(config, before, say))
-    return max(superlink.run_folders(config) - before)
+    return superlink.own_run(config, before)
 
 
 def submit(here: Deployment, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
@@ -167,22 +168,24 @@ def submit(here: Deployment, config: Config, timeout_s: float, watch: Callable[[
 
 def news(config: Config, before: set[Path], say: Callable[[str], None]) -> Callable[[], None]:
     """Return a function that says what the run has measured since it was last called."""
-    told = 0
+    seen = {json.dumps(event) for event in _events(config, before)}  # by an earlier process, of a run to be resumed
 
     def tell() -> None:
-        nonlocal told
-        folders = superlink.run_folders(config) - before
-        if not folders or not (max(folders) / "metrics.jsonl").is_file():
-            return
-        events = run_folder.read_events(max(folders) / "metrics.jsonl")
-        for event in events[told:]:
+        for event in _events(config, before):
+            if (written := json.dumps(event)) in seen:
+                continue
+            seen.add(written)
             values = {key: event["values"][key] for key in SHOWN if event["values"].get(key) is not None}
             shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
             if shown and event["kind"] != "held-out":  # `evaluate` has their averages
                 say(f"round {event['round']}, {event['who']}, {event['kind']}: {shown}")
-        told = len(events)
 
     return tell
+
+
+def _events(config: Config, before: set[Path]) -> list[dict[str, Any]]:
+    root = superlink.own_run(config, before)
+    return run_folder.read_events(root / "metrics.jsonl") if root and (root / "metrics.jsonl").is_file() else []
 
 
 def _count(log: Path, words: str = CONNECTED) -> int:

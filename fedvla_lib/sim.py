@@ -12,9 +12,11 @@ gripper down. The closed and open ends of the gripper are the ends of its joint'
 """
 
 import atexit
+import gc
 import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -82,7 +84,7 @@ class So100Env(gymnasium.Env):
         self.model = build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: _Renderer | None = None
-        self._screen = screen or self
+        self._screen = screen  # not itself: what refers to itself is freed late, and by any thread
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
         self._parts = _parts(self.model)
@@ -250,7 +252,7 @@ class So100Env(gymnasium.Env):
         return {"is_success": self._streak >= self._task.hold_steps}
 
     def _draw(self, camera: str) -> np.ndarray:
-        screen = self._screen
+        screen = self._screen or self
         if screen._renderer is None:
             screen._renderer = _open_renderer(screen.model, screen.image_size)
         return screen._renderer.draw(self.model, self.data, camera)
@@ -298,12 +300,25 @@ class _Renderer(mujoco.Renderer):
         self._view.fixedcamid = model.camera(camera).id
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._options, None, self._view, everything, self.scene)
-        return self.render()
+        with _uncollected():
+            return self.render()
 
     def close(self) -> None:
         if self._gl_context:
             self._gl_context.make_current()
         super().close()
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Put off Python's garbage collection: the end of another renderer would take away the context that is drawn in."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _open_renderer(model: mujoco.MjModel, image_size: int) -> _Renderer:

@@ -28,6 +28,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fedvla_lib import run_folder
 from fedvla_lib.config import Config, check, to_run_config
 from fedvla_lib.credentials import ServerFiles
 
@@ -127,7 +128,7 @@ def run_simulation(
             federation = f"num-supernodes={config.num_clients} {resources}"
             options = ["--federation-config", federation, "--run-config", str(settings)]
             require_completed(link, _submit(link, app, options, timeout_s))
-    return Path(config.resume) if config.resume else max(run_folders(config) - before)
+    return own_run(config, before)
 
 
 def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) -> str:
@@ -246,6 +247,17 @@ def absolute(config: Config) -> Config:
 def run_folders(config: Config) -> set[Path]:
     """Return the run folders there are where `config` writes."""
     return {stamp.parent for stamp in Path(config.out).glob("*/stamp.json")}
+
+
+def own_run(config: Config, before: set[Path]) -> Path | None:
+    """Return the folder that a run writes: the one to be resumed, or the newest with its settings not in `before`.
+
+    Others may write to the same place meanwhile. None: it has not begun.
+    """
+    if config.resume:
+        return Path(config.resume)
+    wanted, new = run_folder.config_hash(config), run_folders(config) - before
+    return max((r for r in new if run_folder.config_hash(run_folder.read_config(r)) == wanted), default=None)
 
 
 def require_completed(link: SuperLink, run_id: str) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from flwr.app import RecordDict
 from safetensors.numpy import load_file
 
 from fedvla_lib import client_app, clients, credentials, deploy, engine, record, run_folder, superlink
-from fedvla_lib.cli import build_parser, main
+from fedvla_lib.cli import build_parser, main, settings
 from fedvla_lib.config import from_profile, to_run_config
 
 ROOT = Path(__file__).parents[1]
@@ -164,6 +165,31 @@ def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(standing, tiny,
     assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")
 
 
+def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tiny, tmp_path, monkeypatch, capsys):
+    whole, begun = engine.run_inline(tiny, progress=False), tmp_path / "begun"
+    shutil.copytree(whole, begun)
+    shutil.rmtree(begun / "checkpoints/round_2")
+    run_folder.write_json(begun / "stamp.json", {**run_folder.read_stamp(begun), "status": "interrupted"})
+    monkeypatch.setattr(deploy, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 0
+    said = capsys.readouterr().out
+    assert "round 2, client_1, train: loss" in said and "round 1, client_1" not in said and str(begun) in said
+    resumed, at_once = (load_file(root / "global_model/round_2/model.safetensors") for root in (begun, whole))
+    assert apart(resumed, at_once) <= 1e-6
+    trained, wanted = (run_folder.read_metrics(root, "train")[["round", "who"]] for root in (begun, whole))
+    assert trained.values.tolist() == wanted.values.tolist()
+
+
+@pytest.mark.unit
+def test_a_run_is_told_from_another_one_that_began_later_in_the_same_place(tiny):
+    before = superlink.run_folders(tiny)
+    assert superlink.own_run(tiny, before) is None
+    another = replace(tiny, seed=7)
+    with run_folder.start(tiny, engine="flower") as own, run_folder.start(another, engine="flower") as later:
+        assert own.root < later.root and superlink.own_run(tiny, before) == own.root
+    assert superlink.own_run(tiny, {own.root}) is None
+
+
 def given(config):
     """Settings that differ from those of the profile."""
     usual = to_run_config(from_profile("tiny"))
@@ -204,6 +230,13 @@ def left_over(port: str) -> list[str]:
         if not found or time.monotonic() > deadline:
             return found
         time.sleep(1)
+
+
+@pytest.mark.unit
+def test_a_deployment_has_as_many_clients_as_asked_for_or_as_its_profile():
+    asked = [["deploy", "--profile", "tiny", *more] for more in ([], ["--clients", "5"], ["--num-clients", "5"])]
+    found = [settings(build_parser().parse_args(words)).num_clients for words in asked]
+    assert found == [from_profile("tiny").num_clients, 5, 5]
 
 
 @pytest.mark.unit

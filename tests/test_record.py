@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import av
 import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
@@ -189,6 +190,22 @@ def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same
         assert dataset[4][image_key("front")].shape == (3, SIZE, SIZE)
         write(root, 3)
         assert_same(root, tmp_path / "whole")
+
+
+@pytest.mark.unit
+def test_x264_is_kept_from_its_code_whose_bits_vary(tmp_path):
+    """It names what it uses of the processor in its log."""
+    av.logging.set_level(av.logging.INFO)
+    try:
+        with av.logging.Capture() as log, av.open(str(tmp_path / "film.mp4"), "w") as film:
+            stream = film.add_stream("h264", FPS, options=recording_module._encoder().get_codec_options(1, True))
+            stream.width, stream.height, stream.pix_fmt = SIZE, SIZE, "yuv444p"
+            film.mux(stream.encode(av.VideoFrame(SIZE, SIZE, "yuv444p")))
+            film.mux(stream.encode())
+    finally:
+        av.logging.set_level(None)
+    said = "".join(line for _, _, line in log)
+    assert "using cpu capabilities" in said and "AVX512" not in said and "error" not in said.lower()
 
 
 @pytest.mark.integration

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import weakref
 
 import gymnasium
 import numpy as np
@@ -481,6 +482,38 @@ def test_frames_survive_the_end_of_another_environment():
     np.testing.assert_array_equal(env.render(), before)
     env.close()
     np.testing.assert_array_equal(env.render(), before)  # and closing is not the end
+
+
+def test_an_environment_that_nobody_holds_is_gone_at_once():
+    env = So100Env("lift", image_size=SIZE)
+    env.reset(seed=0)
+    seen = weakref.ref(env)
+    gc.disable()  # which would come later, and in whichever thread
+    try:
+        del env
+        assert seen() is None
+    finally:
+        gc.enable()
+
+
+def test_the_end_of_another_environment_in_the_middle_of_drawing_is_put_off(monkeypatch):
+    """Python may collect what is left of one between the choice of an OpenGL context and its use."""
+    env, other = (So100Env("lift", image_size=SIZE) for _ in range(2))
+    env.reset(seed=0), other.reset(seed=1)
+    before, context = env.render(), env._renderer._gl_context
+    choose = context.make_current
+
+    def choose_and_allocate():
+        choose()
+        assert len([[] for _ in range(10_000)]) == 10_000  # so many would set off a collection
+
+    other.myself, gone = other, weakref.ref(other)
+    del other
+    monkeypatch.setattr(context, "make_current", choose_and_allocate)
+    np.testing.assert_array_equal(env.render(), before)
+    gc.collect()
+    assert gone() is None
+    np.testing.assert_array_equal(env.render(), before)
 
 
 def test_pictures_are_not_blank():
