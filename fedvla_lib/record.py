@@ -17,8 +17,8 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 from filelock import FileLock
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import DEFAULT_EPISODES_PATH, LeRobotDataset, aggregate_stats, write_stats
@@ -256,7 +256,7 @@ def _encoder() -> RGBEncoderConfig:
     With that, 15 of 6,000 videos of the same episode came out with one block in other bits; with its code for AVX2,
     which gives the bits of the others, none of 6,000.
     """
-    has_avx512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
+    has_avx512 = pa.runtime_info().detected_simd_level == "avx512"
     return RGBEncoderConfig(**VIDEO, extra_options={"x264-params": f"asm={AVX2}"} if has_avx512 else {})
 
 
