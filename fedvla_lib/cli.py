@@ -402,8 +402,11 @@ def _chosen(options: argparse.Namespace) -> Config:
 
 
 def _to_resume(options: argparse.Namespace) -> Config:
-    """Return the settings of an interrupted run; with it only what does not change the result may be given."""
-    from fedvla_lib.run_folder import read_config
+    """Return the settings of an interrupted run; with it only what does not change the result may be given.
+
+    Whether it can go on is asked before anything is started for it.
+    """
+    from fedvla_lib.run_folder import hold, read_config, resumable
 
     names = {field.name for field in fields(Config)} - {"resume", "num_threads"}
     if given := sorted(names & set(vars(options))):
@@ -411,7 +414,10 @@ def _to_resume(options: argparse.Namespace) -> Config:
     if not (options.resume / "config.json").is_file():
         raise ValueError(f"--resume {options.resume}: no run folder there, it has no config.json")
     threads = {"num_threads": options.num_threads} if "num_threads" in vars(options) else {}
-    return replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
+    chosen = replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
+    with hold(options.resume):
+        resumable(options.resume, chosen)
+    return chosen
 
 
 def deploy(options: argparse.Namespace) -> None:

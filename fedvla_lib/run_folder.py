@@ -78,7 +78,7 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
     with hold(root):
         stamp = first_stamp(config, engine)
         if config.resume:
-            earlier = _resumable(root, config)
+            earlier = resumable(root, config)
             stamp |= {"started": earlier["started"], "resumed": [*earlier.get("resumed", []), stamp["started"]]}
         else:
             write_json(root / "config.json", asdict(config))
@@ -138,9 +138,13 @@ def _existing(root: Path) -> Path:
     return root
 
 
-def _resumable(root: Path, config: Config) -> dict[str, Any]:
-    """Return the stamp of a run that these settings can go on with."""
-    stamp, theirs = read_stamp(root), read_config(root)
+def resumable(root: Path, config: Config) -> dict[str, Any]:
+    """Return the stamp of a run that these settings can go on with.
+
+    Raises:
+        ValueError: no run, a completed one, or one with other settings.
+    """
+    stamp, theirs = read_stamp(_existing(root)), read_config(root)
     if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to go on with")
     if config_hash(theirs) != config_hash(config):

@@ -178,6 +178,10 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     assert apart(resumed, at_once) <= 1e-6
     trained, wanted = (run_folder.read_metrics(root, "train")[["round", "who"]] for root in (begun, whole))
     assert trained.values.tolist() == wanted.values.tolist()
+    monkeypatch.setattr(deploy, "deployment", None)  # nothing is started any more
+    assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 2
+    said = capsys.readouterr()
+    assert "is a completed run" in said.err and said.err.count("\n") == 1 and not said.out
 
 
 @pytest.mark.unit

@@ -155,6 +155,7 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
         (str(tmp_path / "nowhere"),): "no run folder there",
         (str(done), "--lr", "0.1"): "--lr cannot be given with --resume",
     }
+    capsys.readouterr()
     for arguments, words in refusals.items():
         assert main(["run", "--resume", *arguments]) == 2
         said = capsys.readouterr().err
