@@ -9,7 +9,8 @@
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
 # Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=2 (processes that
-# share the test files, then the chapters; every one computes on one thread and takes 2 GB).
+# share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS=2 (chapters that
+# `make book` executes at a time, at the profile tiny only).
 .DEFAULT_GOAL := help
 .PHONY: help env book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
@@ -49,7 +50,7 @@ export MUJOCO_GL ?= egl
 endif
 
 help:
-	@sed -n '1,11s/^# \{0,1\}//p' Makefile
+	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
 env: $(STAMP)
 
@@ -84,7 +85,7 @@ data: $(STAMP)
 
 # Records the demonstrations first, unless no chapter has to be executed.
 book: doctor
-	$(BIN)/python book/build_book.py --profile $(FEDVLA_PROFILE)
+	$(BIN)/python book/build_book.py --profile $(FEDVLA_PROFILE) $(if $(BOOK_JOBS),--jobs $(BOOK_JOBS))
 
 # Every page of the rendered book, in the system's Chromium.
 check-site: $(STAMP)
@@ -112,15 +113,14 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md book/*.md notebooks/*.ipynb
 
-# Coverage counts the tests alone. The chapters then run twice at the tiny profile: with nbmake as the reader of the zip runs
-# them, from the wheel, and in this folder with injected parameters (papermill); the second copies are what CI renders.
+# Coverage counts the tests alone. The chapters then run at the tiny profile, with nbmake, as the reader of the zip runs them:
+# from the wheel. In this folder, with injected parameters (papermill), `make book` runs them; .ci/run does both.
 test: export FEDVLA_PROFILE := tiny
 test: export HF_HUB_OFFLINE := 1
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
 	$(BIN)/python book/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml $(CURDIR)/_build/tests/junit-notebooks.xml
-	$(BIN)/python book/build_book.py --profile tiny --execute-only --jobs $(TEST_WORKERS)
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \
