@@ -1,11 +1,16 @@
-"""The four ways of training that the book compares, on the same data, from the same start, at equal gradient steps.
+"""The four ways of training that the book compares, on the same data and from the same start.
 
 ``base`` is the start itself; ``local-only`` is one client on its own episodes; ``federated`` is Flower's FedAvg over
-all clients; ``centralized`` pools the clients' training episodes. Results are kept in the cache and found again by
-settings and by the code that decides them, so that a change of either trains anew.
+all clients; ``centralized`` pools the clients' training episodes. From the same settings, *centralized* is given the
+steps that all clients of the federation do together, and *local-only* its share of them, which is fewer: total over
+number of clients. What a model then took is counted while it trains, see `counted`. Results are kept in the cache and
+found again by settings and by the code that decides them, so that a change of either trains anew.
 """
 
 import hashlib
+import json
+import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +21,10 @@ from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
 from fedvla_lib.config import Config, cache_dir, code_digest
 from fedvla_lib.roster import draw_size
-from fedvla_lib.train import local_train
+from fedvla_lib.train import TrainResult, local_train
+
+CENTRALIZED = "centralized"
+STEPS_FILE = "steps.json"  # beside the weights of a model in the cache: the steps that it took, counted
 
 # Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
 TRAINED_BY = (
@@ -27,17 +35,17 @@ TRAINED_BY = (
 
 
 def total_steps(config: Config) -> int:
-    """Gradient steps that all clients together do in a federated run: what the centralized arm may spend."""
+    """Gradient steps that a federated run asks of all clients together: what the centralized arm may spend."""
     return steps_in_a_row(config) * draw_size(config.fraction_train, config.num_clients)
 
 
 def steps_per_client(config: Config) -> int:
-    """Gradient steps that one client does in a federated run, on average where a round draws some of them."""
+    """Gradient steps that a federated run asks of one client, on average where a round draws some of them."""
     return max(1, total_steps(config) // config.num_clients)
 
 
 def steps_in_a_row(config: Config) -> int:
-    """Gradient steps between the start and the last global model of a federated run, one after the other."""
+    """Gradient steps that a federated run asks for between start and last global model, one after the other."""
     return config.num_server_rounds * config.local_steps
 
 
@@ -65,32 +73,67 @@ def base(config: Config) -> model.Bundle:
 def centralized(config: Config, progress: bool = True) -> model.Bundle:
     """Train on all clients' training episodes for the steps that all clients do together."""
     whole = _everything(config)
-    return _kept(config, "centralized", lambda: _train(config, whole, total_steps(config), progress))
+    return _kept(config, CENTRALIZED, lambda: _train(config, whole, total_steps(config), progress))
 
 
 def local_only(config: Config, partition_id: int, progress: bool = True) -> model.Bundle:
-    """Train on one client's episodes alone, for as many steps as it does in the federation.
+    """Train on one client's episodes alone, for as many steps as the federation asks of it on average.
 
     The normalisation is the pooled one, as in the federation: what differs is only whose episodes are seen.
     """
     client = clients.open_client(config, partition_id)
     steps = steps_per_client(config)
-    return _kept(config, f"local-only-{partition_id}", lambda: _train(config, client, steps, progress))
+    return _kept(config, _alone_name(partition_id), lambda: _train(config, client, steps, progress))
 
 
-def _train(config: Config, client: Client, steps: int, progress: bool) -> model.Bundle:
+def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:
+    """Return the gradient steps that a model in the cache took, counted while it trained: ``in_all``, ``in_a_row``.
+
+    The two are equal here. They differ in a federation, whose clients train side by side: `run_folder.counted_steps`.
+
+    Args:
+        partition_id: the client that trained alone; None for the centralized model.
+
+    Raises:
+        ValueError: there is no such model with these settings yet.
+    """
+    name = CENTRALIZED if partition_id is None else _alone_name(partition_id)
+    file = _place(config, name) / STEPS_FILE
+    if not file.is_file():
+        raise ValueError(f"{name} has not been trained with these settings: train it before asking for its steps")
+    return json.loads(file.read_text())
+
+
+def _alone_name(partition_id: int) -> str:
+    return f"local-only-{partition_id}"
+
+
+def _train(config: Config, client: Client, steps: int, progress: bool) -> tuple[model.Bundle, TrainResult]:
     bundle = base(config)
-    local_train(bundle, prefix.stored(bundle, client.batches()), config, steps=steps, progress=progress)
-    return bundle
+    batches = prefix.stored(bundle, client.batches())
+    return bundle, local_train(bundle, batches, config, steps=steps, progress=progress)
 
 
-def _kept(config: Config, name: str, train: Callable[[], model.Bundle]) -> model.Bundle:
+def _kept(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
     """Load the arm's model from the cache, or train and keep it."""
-    folder = cache_dir() / "arms" / f"{name}-{_key(config)}"
+    folder = _place(config, name)
     with _alone(folder):
         if not folder.exists():
-            model.save_policy(train(), folder)
+            _keep(folder, *train())
     return model.load_policy(replace(config, base=str(folder)))
+
+
+def _keep(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
+    """Write the model and, beside it, the steps that it took; both are there before the folder appears."""
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".keeping-") as scratch:
+        made = Path(scratch) / "policy"
+        model.save_policy(bundle, made)
+        run_folder.write_json(made / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
+        os.replace(made, folder)
+
+
+def _place(config: Config, name: str) -> Path:
+    return cache_dir() / "arms" / f"{name}-{_key(config)}"
 
 
 def _alone(kept: Path) -> FileLock:

@@ -354,7 +354,7 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
     result = local_train(bundle, batches, chosen, steps=steps, checkpoint_dir=checkpoints, resume=resume)
     save_policy(bundle, folder.root / "model")
     frames, measured = _measure_into(folder, chosen, learner.store, bundle)
-    folder.log(0, LOCAL, "evaluate", {"gradient_steps": steps, "num_examples": frames, **measured})
+    folder.log(0, LOCAL, "evaluate", {"gradient_steps": result.steps, "num_examples": frames, **measured})
     print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
     print(f"on {frames} held-out frames: " + ", ".join(f"{name} {value:.3f}" for name, value in measured.items()))
     print(folder.root / "model")

@@ -56,6 +56,7 @@ def build(tools: clients.Tools = clients.TOOLS, mods: Sequence[Mod] = ()) -> Cli
         arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
         metrics = {
             wire.EXAMPLES: result.num_examples,
+            wire.STEPS: result.steps,
             "loss": sum(result.losses) / len(result.losses),
             "seconds": result.seconds,
         }

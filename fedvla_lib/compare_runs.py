@@ -60,10 +60,15 @@ def _last(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _gradient_steps(folder: Path, config: Config) -> int:
-    """Steps that were done: what a local training says, or local steps times the replies that were averaged."""
+    """Steps that were done: what a training in one place counted, or what the clients did.
+
+    Of runs from before clients counted, local steps times the replies that were averaged.
+    """
     evaluated = run_folder.read_metrics(folder, "evaluate")
     if "gradient_steps" in evaluated:
         return int(evaluated.gradient_steps.dropna().iloc[-1])
+    if counted := run_folder.counted_steps(folder):
+        return counted["in_all"]
     return len(run_folder.read_metrics(folder, "train")) * config.local_steps
 
 

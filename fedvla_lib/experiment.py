@@ -39,6 +39,7 @@ from fedvla_lib import arms, clients, data, run_folder, train
 from fedvla_lib.config import Config, code_digest, from_profile
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.model import Bundle
+from fedvla_lib.roster import client_name
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
@@ -72,6 +73,8 @@ class Measured:
     held_out: dict[str, float]  # averages over held-out frames, and num_examples
     episodes: list[dict[str, float]] = field(default_factory=list)  # the same, of each held-out episode
     rounds: list[dict[str, Any]] = field(default_factory=list)  # events of a federated run before its last round
+    # Gradient steps that each model counted while it trained, by its name: global, or client_K where each has its own.
+    steps: dict[str, dict[str, int]] = field(default_factory=lambda: {GLOBAL: {"in_all": 0, "in_a_row": 0}})
     bytes: int = 0  # that travelled
     train_s: float = 0.0
 
@@ -162,11 +165,12 @@ def keep(cell: Cell, seeds: Sequence[int], out: Path) -> float:
     scratch = RunFolder(out / f".{cell.name}.{os.getpid()}")
     shutil.rmtree(scratch.root, ignore_errors=True)
     scratch.root.mkdir()
-    steps = 0 if cell.kind == "base" else arms.total_steps(config)
+    steps = sum(of_model["in_all"] for of_model in found.steps.values())
     run_folder.write_json(scratch.root / "config.json", asdict(cell.config))
     _log(scratch, found, 0 if cell.kind == "base" else config.num_server_rounds, steps)
-    known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "gradient_steps": steps,
-             "samples": steps * config.batch_size, "bytes": found.bytes, "train_s": found.train_s}  # fmt: skip
+    known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "steps": found.steps,
+             "gradient_steps": steps, "samples": steps * config.batch_size, "bytes": found.bytes,
+             "train_s": found.train_s}  # fmt: skip
     ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": code_digest(*arms.TRAINED_BY)}
     run_folder.write_json(scratch.root / "stamp.json", stamp | ended | known)
     os.replace(scratch.root, out / cell.name)
@@ -192,7 +196,7 @@ def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
     began = time.perf_counter()
     bundle = arms.centralized(config, progress=False)
     seconds = time.perf_counter() - began
-    return replace(_of_model(bundle, config, seeds), train_s=seconds)
+    return replace(_of_model(bundle, config, seeds), steps={GLOBAL: arms.counted(config)}, train_s=seconds)
 
 
 def _federated(config: Config, seeds: Sequence[int]) -> Measured:
@@ -205,6 +209,7 @@ def _federated(config: Config, seeds: Sequence[int]) -> Measured:
     return replace(
         _of_model(arms.federated_policy(config), config, seeds),
         rounds=[event for event in earlier if event["kind"] in ("evaluate", "rollout")],
+        steps={GLOBAL: run_folder.counted_steps(folder)},
         bytes=_travelled(folder),
         train_s=run_folder.read_stamp(folder)["wall_s"],
     )
@@ -217,11 +222,12 @@ def _travelled(folder: Path) -> int:
 
 def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure every client's own model: all held-out episodes for each, the attempts dealt out over them."""
-    each, seconds = [], 0.0
+    each, steps, seconds = [], {}, 0.0
     for client in range(config.num_clients):
         began = time.perf_counter()
         bundle = arms.local_only(config, client, progress=False)
         seconds += time.perf_counter() - began
+        steps[client_name(client)] = arms.counted(config, client)
         found = _of_model(bundle, config, seeds[client :: config.num_clients])
         each.append(replace(found, rows=[{**row, "client": client} for row in found.rows]))
     episodes = pd.DataFrame([of_episode for found in each for of_episode in found.episodes])
@@ -229,6 +235,7 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
         rows=[row for found in each for row in found.rows],
         held_out=pd.DataFrame([found.held_out for found in each]).mean().to_dict(),
         episodes=episodes.groupby("episode_id", as_index=False).mean().to_dict("records") if len(episodes) else [],
+        steps=steps,
         train_s=seconds,
     )
 
@@ -255,6 +262,7 @@ def _clients(config: Config, seeds: Sequence[int]) -> Measured:
         rows=own["rollout"].to_dict("records"),
         held_out={"num_examples": int(last.num_examples.sum()),
                   "loss": float(np.average(last.loss, weights=last.num_examples))},
+        steps={GLOBAL: run_folder.counted_steps(run)},  # what the clients share; their own parts took some of them
         bytes=int(training.sent_bytes.sum() + training.received_bytes.sum()),
         train_s=run_folder.read_stamp(run)["wall_s"],
     )  # fmt: skip

@@ -187,6 +187,18 @@ def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
     return pd.DataFrame([{**e["values"], **{key: e[key] for key in fixed}} for e in events], columns=fixed + named)
 
 
+def counted_steps(root: Path) -> dict[str, int] | None:
+    """Return the gradient steps behind a federated run's global model, as its clients counted them.
+
+    ``in_all`` sums over all replies that were averaged; ``in_a_row`` over rounds, of each the client with the most,
+    since the clients of a round train side by side. None where a reply has no count: such a run is older than counting.
+    """
+    trained = read_metrics(root, "train")
+    if "steps" not in trained or trained.steps.isna().any():
+        return None
+    return {"in_all": int(trained.steps.sum()), "in_a_row": int(trained.groupby("round").steps.max().sum())}
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write `content` as readable JSON, whole or not at all."""
     write_atomically(path, (json.dumps(_plain(content), indent=2) + "\n").encode())

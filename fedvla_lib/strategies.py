@@ -226,6 +226,9 @@ class Checked:
         _check_metrics(reply, wire.TRAIN_METRICS)
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{wire.EXAMPLES}=0: a client without training frames has no weight")
+        steps = reply.content.metric_records[wire.METRICS][wire.STEPS]
+        if not isinstance(steps, int) or steps < 1:
+            raise ParameterError("metrics", f"{wire.STEPS}={steps!r}: expected a whole number of steps, 1 or more")
         announced = self.roster.examples_of.get(reply.metadata.src_node_id, _examples(reply))
         if _examples(reply) != announced:  # it would buy itself another weight in the average
             raise ParameterError("examples", f"{wire.EXAMPLES}={_examples(reply)}, but it came with {announced}")

@@ -53,7 +53,7 @@ class TrainResult:
 
     losses: list[float]  # flow-matching loss of each step, in order
     num_examples: int  # training frames of the client: its weight in federated averaging
-    steps: int  # optimiser steps done in this call
+    steps: int  # optimiser steps behind the weights, counted as they were done, those before a resume included
     seconds: float  # wall time of this call
     moments: Arrays = field(default_factory=dict)  # the optimiser's state by name, for who goes on from here
 
@@ -106,7 +106,7 @@ def local_train(
                 _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoint_dir))
         bundle.policy.eval()
         after = {} if moments is None else _moments(bundle, optimizer)
-    return TrainResult(losses, batches.num_examples, steps, time.perf_counter() - started, after)
+    return TrainResult(losses, batches.num_examples, len(losses), time.perf_counter() - started, after)
 
 
 @torch.no_grad()

@@ -30,6 +30,7 @@ NOTE = "note"
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
+STEPS = "steps"  # gradient steps that a client counted while it trained
 DIGEST = "sha256"  # of the arrays
 CONTROL_DIGEST = "sha256-control"
 PROXIMAL_MU = "proximal-mu"  # Flower's own key
@@ -40,7 +41,7 @@ ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # no longe
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 # The numbers of a reply, all of them and no others: Flower averages records with equal keys only.
-TRAIN_METRICS = (EXAMPLES, "loss", "seconds")
+TRAIN_METRICS = (EXAMPLES, STEPS, "loss", "seconds")
 EVALUATE_METRICS = (EXAMPLES, "loss", "action_error", "action_accuracy", *(f"action_error.{j}" for j in JOINT_NAMES))
 
 Stats = dict[str, dict[str, np.ndarray]]
