@@ -10,7 +10,7 @@ import nbformat
 import papermill
 
 from fedvla_lib import run_folder
-from fedvla_lib.config import code_digest, from_profile
+from fedvla_lib.config import from_profile
 
 REPORTS = "_build/tests"  # where make test leaves its reports
 UNKNOWN = "–"
@@ -98,7 +98,7 @@ def _reference(folder: Path) -> str:
     from fedvla_lib import arms  # loads the model's packages, which only this needs
 
     notes = tomllib.loads((folder / "notes.toml").read_text(encoding="utf-8"))["code"]
-    today, rows = code_digest(*arms.TRAINED_BY), []
+    today, rows = arms.trained_by(), []
     for plan in sorted(folder.glob("*.toml")):
         stamps = [run_folder.read_stamp(file.parent) for file in sorted(folder.glob(f"{plan.stem}/*/stamp.json"))]
         if not stamps:

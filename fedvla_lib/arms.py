@@ -19,20 +19,13 @@ from filelock import FileLock
 
 from fedvla_lib import clients, data, engine, model, prefix, run_folder, wire
 from fedvla_lib.clients import Client, Share
-from fedvla_lib.config import Config, cache_dir, code_digest
+from fedvla_lib.config import Config, cache_dir
+from fedvla_lib.provenance import code_digest
 from fedvla_lib.roster import draw_size
 from fedvla_lib.train import TrainResult, local_train
 
 CENTRALIZED = "centralized"
 STEPS_FILE = "steps.json"  # beside the weights of a model in the cache: the steps that it took, counted
-
-# Code that decides what an arm learns; what only draws, compares or starts things may change without training anew.
-TRAINED_BY = (
-    *data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train", "config", "partition", "params",
-    "corrections", "quantise", "lora", "clients", "client_app", "server_app", "grid", "strategies", "roster", "wire",
-    "evaluate", "engine", "arms",
-)  # fmt: skip
-
 
 def total_steps(config: Config) -> int:
     """Gradient steps that a federated run asks of all clients together: what the centralized arm may spend."""
@@ -154,7 +147,12 @@ def _pooled_stats(config: Config) -> str:
     return wire.pack_stats(clients.common_statistics(config, _everything(config).statistics()))
 
 
+def trained_by() -> str:
+    """Return the digest of the code that decides what a method's model learns."""
+    return code_digest(federated)
+
+
 def _key(config: Config) -> str:
     """Identify settings, start and code: what older code or another base brought must not pass for a result of this."""
-    whole = "|".join([run_folder.config_hash(config), model.base_digest(config.base), code_digest(*TRAINED_BY)])
+    whole = "|".join([run_folder.config_hash(config), model.base_digest(config.base), trained_by()])
     return hashlib.sha256(whole.encode()).hexdigest()[:16]

@@ -4,7 +4,6 @@ The same names, written with dashes, are the keys of ``[tool.flwr.app.config]`` 
 ``flwr run --run-config``. A profile is a set of numbers, never a branch in the code.
 """
 
-import hashlib
 import os
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -173,19 +172,6 @@ def granted_threads(config: Config) -> int:
 def cache_dir() -> Path:
     """Return where recordings, decoded frames and meshes are kept: ``$FEDVLA_CACHE``, else ``~/.cache/fedvla``."""
     return Path(os.environ.get("FEDVLA_CACHE") or Path.home() / ".cache" / "fedvla")
-
-
-def code_digest(*modules: str) -> str:
-    """Return a short hash of the source of these modules of the library (all, if none are named).
-
-    What is kept in the cache carries it in its name, so that results of older code do not pass for results of this.
-    """
-    folder = Path(__file__).parent
-    files = [folder / f"{name}.py" for name in modules] or sorted(folder.glob("*.py"))
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def check(config: Config) -> Config:

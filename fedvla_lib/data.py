@@ -18,20 +18,15 @@ import pandas as pd
 import torch
 from lerobot.datasets import aggregate_stats
 
-from fedvla_lib.config import Config, cache_dir, code_digest, task_names
+from fedvla_lib.config import Config, cache_dir, task_names
+from fedvla_lib.provenance import code_digest
 from fedvla_lib.record import record
 from fedvla_lib.source import DataError
 from fedvla_lib.spec import ACTION_KEY, JOINT_NAMES, STATE_KEY, image_key
 from fedvla_lib.store import FrameStore, open_store
 
-__all__ = [
-    "Batches", "DataError", "FrameStore", "Stats", "episode_stats", "frames", "open_store", "pool_stats", "record",
-    "resolve", "split",
-]  # fmt: skip
-
 Stats = dict[str, dict[str, np.ndarray]]  # feature key -> mean, std, min, max, count
 
-RECORDED_BY = ("tasks", "lab", "scene", "sim", "expert", "rollout", "record")  # a recording follows from this code
 SHIFT_SHARE = 0.01  # largest random shift, as a share of the image side: 1 pixel of 96
 CONTRAST, BRIGHTNESS = 0.2, 0.1  # contrast is scaled by 1 +- 0.2, brightness moved by +- 0.1 of full scale
 ORDER_STREAM, AUGMENT_STREAM = 0, 1  # which independent random stream of a seed is meant
@@ -44,7 +39,7 @@ def resolve(config: Config) -> Path | str:
         return folder if folder.exists() else config.data
     tasks = task_names(config)
     settings = [tasks, config.image_size, config.episodes_per_task, config.seed, config.num_labs]
-    key = json.dumps([*settings, code_digest(*RECORDED_BY)])
+    key = json.dumps([*settings, code_digest(record)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     root = cache_dir() / "recordings" / name
     return record(

@@ -36,7 +36,7 @@ import numpy as np
 import pandas as pd
 
 from fedvla_lib import arms, clients, data, run_folder, train
-from fedvla_lib.config import Config, code_digest, from_profile
+from fedvla_lib.config import Config, from_profile
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.model import Bundle
 from fedvla_lib.roster import client_name
@@ -44,6 +44,7 @@ from fedvla_lib.run_folder import GLOBAL, RunFolder
 
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
 NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
+KINDS = ("base", "federated", "centralized", "local-only", "clients")  # of training, and of what is measured of it
 RULES = ("arm", "partition", "seed", "kind")  # what a rule under [[only]] may name
 # A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
 QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_rollouts": 0, "checkpoint_every": 0}
@@ -135,8 +136,8 @@ def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
                 kind = own.pop("kind", "federated")
                 if bad := [name for name in (partition, arm) if not FILE_NAME.fullmatch(name)]:
                     raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
-                if kind not in MEASURES:
-                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(MEASURES)}")
+                if kind not in KINDS:
+                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
                 settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
                 yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings))
 
@@ -171,7 +172,7 @@ def keep(cell: Cell, seeds: Sequence[int], out: Path) -> float:
     known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "steps": found.steps,
              "gradient_steps": steps, "samples": steps * config.batch_size, "bytes": found.bytes,
              "train_s": found.train_s}  # fmt: skip
-    ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": code_digest(*arms.TRAINED_BY)}
+    ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": arms.trained_by()}
     run_folder.write_json(scratch.root / "stamp.json", stamp | ended | known)
     os.replace(scratch.root, out / cell.name)
     return sum(row["success"] for row in found.rows) / len(found.rows)

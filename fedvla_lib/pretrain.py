@@ -23,10 +23,11 @@ import pandas as pd
 
 from fedvla_lib import data, model
 from fedvla_lib.compare import success_table
-from fedvla_lib.config import Config, Recipe, cache_dir, code_digest
+from fedvla_lib.config import Config, Recipe, cache_dir
 from fedvla_lib.evaluate import evaluate, rollout_seeds
 from fedvla_lib.ground import Questions, grounding_loss, pointing_error_m, probing
 from fedvla_lib.prefix import stored
+from fedvla_lib.provenance import code_digest
 from fedvla_lib.run_folder import first_stamp, write_json
 from fedvla_lib.scenery import draw_scenery
 from fedvla_lib.sim import So100Env
@@ -35,7 +36,6 @@ from fedvla_lib.train import local_train
 
 CARD_FILE = "pretraining.json"
 TWO_CUBES = ("reach", "grip")  # tasks in which a second cube can stand on the table
-TRAINED_BY = (*data.RECORDED_BY, "source", "store", "data", "nano", "model", "prefix", "train", "scenery", "ground")
 
 
 def settings(recipe: Recipe) -> Config:
@@ -188,7 +188,7 @@ def _num_cubes(env: So100Env, seed: int) -> int:
 
 def _work_folder(recipe: Recipe) -> Path:
     """Where recording and checkpoints of this recipe, trained by this code, are kept until it is done."""
-    key = json.dumps(asdict(recipe), sort_keys=True) + code_digest(*TRAINED_BY)
+    key = json.dumps(asdict(recipe), sort_keys=True) + code_digest(pretrain)
     return cache_dir() / f"pretraining-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
 

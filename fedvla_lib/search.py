@@ -18,7 +18,7 @@ from optuna.trial import TrialState
 
 from fedvla_lib import arms, clients, run_folder
 from fedvla_lib.compare import wilson
-from fedvla_lib.config import STRATEGIES, Config, check, code_digest
+from fedvla_lib.config import STRATEGIES, Config, check
 from fedvla_lib.evaluate import rollout_seeds
 from fedvla_lib.experiment import QUIET, with_recording
 from fedvla_lib.model import Bundle
@@ -71,7 +71,7 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
     )  # fmt: skip
     if not study.get_trials(states=[TrialState.COMPLETE]):
         raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
-    ended = {"status": "completed", "code": code_digest(*arms.TRAINED_BY)}
+    ended = {"status": "completed", "code": arms.trained_by()}
     found = {
         "budget": arms.total_steps(config),
         "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],

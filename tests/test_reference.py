@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fedvla_lib import arms, experiment, results, run_folder, search
-from fedvla_lib.config import Config, code_digest
+from fedvla_lib.config import Config
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
@@ -112,7 +112,7 @@ def test_stored_searches_are_complete_and_differ_in_the_strategy_alone():
 
 
 def test_results_of_other_code_carry_a_note():
-    notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], code_digest(*arms.TRAINED_BY)
+    notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], arms.trained_by()
     stamps = [run_folder.read_stamp(cell) for cell in CELLS]
     # The first search is older than the digest.
     stamps += [one["stamp"] for one in SEARCHES.values() if "code" in one["stamp"]]

@@ -9,7 +9,7 @@ import pytest
 from fedvla_lib import arms, clients, search
 from fedvla_lib.cli import main
 from fedvla_lib.compare import wilson
-from fedvla_lib.config import Config, code_digest, from_profile
+from fedvla_lib.config import Config, from_profile
 from fedvla_lib.strategies import SERVER_LR
 
 
@@ -58,7 +58,7 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     assert found["selection_loss"] == min(losses)
     assert found["best"]["loss"] != found["selection_loss"]  # measured on other episodes
     assert found["start"]["n"] == found["best"]["n"] == 2
-    assert found["stamp"]["code"] == code_digest(*arms.TRAINED_BY)  # as in a run folder of an experiment
+    assert found["stamp"]["code"] == arms.trained_by()  # as in a run folder of an experiment
     assert found["first_rollout_seed"] == search.ROLLOUTS_FROM
     config = from_profile("tiny", tasks="lift,push", num_clients=2, data=str(recording), val_fraction=0.5)
     store = clients.open_frames(config)
