@@ -85,26 +85,26 @@ data: $(STAMP)
 
 # Records the demonstrations first, unless no chapter has to be executed.
 book: doctor
-	$(BIN)/python book/build_book.py --profile $(FEDVLA_PROFILE) $(if $(BOOK_JOBS),--jobs $(BOOK_JOBS))
+	$(BIN)/python book/tools/build_book.py --profile $(FEDVLA_PROFILE) $(if $(BOOK_JOBS),--jobs $(BOOK_JOBS))
 
 # Every page of the rendered book, in the system's Chromium.
 check-site: $(STAMP)
-	$(BIN)/python book/check_site.py _build/html/$(FEDVLA_PROFILE)
+	$(BIN)/python book/tools/check_site.py _build/html/$(FEDVLA_PROFILE)
 
 # What is attached to a release.
 zip: $(STAMP)
-	$(BIN)/python book/make_zip.py
+	$(BIN)/python book/tools/make_zip.py
 
 # Every chapter from that zip, at the profile tiny: an empty folder, and the wheel in place of the source.
 check-zip: $(STAMP)
-	$(BIN)/python book/check_zip.py -n $(TEST_WORKERS) --dist loadfile
+	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile
 
 # Needs the executed chapters of `make book`, and the system's Chromium.
 pdf: $(STAMP)
-	$(BIN)/python book/make_pdf.py --profile $(FEDVLA_PROFILE)
+	$(BIN)/python book/tools/make_pdf.py --profile $(FEDVLA_PROFILE)
 
 new-chapter: $(STAMP)
-	@$(BIN)/python book/new_chapter.py "$(NAME)"
+	@$(BIN)/python book/tools/new_chapter.py "$(NAME)"
 
 lab: $(STAMP)
 	cd notebooks && ../$(BIN)/jupyter lab
@@ -120,7 +120,7 @@ test: export HF_HUB_OFFLINE := 1
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
-	$(BIN)/python book/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml $(CURDIR)/_build/tests/junit-notebooks.xml
+	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml $(CURDIR)/_build/tests/junit-notebooks.xml
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \

@@ -3,10 +3,9 @@
     python benchmarks/control_steps.py
 """
 
+from fedvla_lib.robot import meshes
+from fedvla_lib.robot.sim import HOME, So100Env
 from report import laptop, median_seconds, options, report, start
-
-from fedvla_lib import scene
-from fedvla_lib.sim import HOME, So100Env
 
 
 def main() -> None:
@@ -17,7 +16,7 @@ def main() -> None:
     config = laptop(chosen.profile)
     ours_s = seconds_per_step(So100Env("lift", config.image_size), chosen)
     blind_s = seconds_per_step(So100Env("lift", config.image_size, cameras=(), render_mode=None), chosen)
-    scene.VISUAL_FACES = 10**9  # no mesh has more, so all are used as they are
+    meshes.VISUAL_FACES = 10**9  # no mesh has more, so all are used as they are
     whole = So100Env("lift", config.image_size)
     whole_s = seconds_per_step(whole, chosen)
     row = {

@@ -13,11 +13,12 @@ from pathlib import Path
 
 from flwr.app import Context, Message
 from flwr.clientapp import ClientApp
-from report import laptop, options, peak_memory_mb, recording, report, start, timed
 
-from fedvla_lib import client_app, clients, engine
 from fedvla_lib.config import Config
+from fedvla_lib.engines import inline
+from fedvla_lib.federation import client, client_app
 from fedvla_lib.run_folder import read_metrics
+from report import laptop, options, peak_memory_mb, recording, report, start, timed
 
 
 def main() -> None:
@@ -57,10 +58,10 @@ def in_its_own_process(count: int, chosen: argparse.Namespace) -> dict[str, floa
 def measure(config: Config) -> dict[str, float]:
     """Run a federation; return its wall time, the time inside its clients, and the most memory held."""
     inside: list[float] = []
-    tools = engine.remembering(clients.TOOLS)
+    tools = inline.cached(client.LOADERS)
     with tempfile.TemporaryDirectory() as out:
         app = Watched(client_app.build(tools), inside)
-        wall = timed(lambda: engine.run_inline(replace(config, out=out), clients_app=app, progress=False))
+        wall = timed(lambda: inline.run_inline(replace(config, out=out), clients_app=app, progress=False))
         (run,) = Path(out).iterdir()
         judged = read_metrics(run, "evaluate").query("who == 'global'").seconds.sum()
     return {"wall": wall, "clients": sum(inside), "judging": float(judged), "memory": peak_memory_mb()}

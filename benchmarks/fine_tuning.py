@@ -1,17 +1,20 @@
 """What the nano base is worth: success at tasks it never saw, after a minute or so of training on one core.
 
-    python benchmarks/fine_tuning.py
+python benchmarks/fine_tuning.py
 """
 
 import torch
-from report import laptop, options, recording, report, start
 
-from fedvla_lib import data, model, prefix
-from fedvla_lib.compare import wilson
 from fedvla_lib.config import Config, task_names
-from fedvla_lib.evaluate import evaluate, rollout_seeds
-from fedvla_lib.store import FrameStore
-from fedvla_lib.train import local_train
+from fedvla_lib.data import normalisation
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.evaluation.rollouts import evaluate, rollout_seeds
+from fedvla_lib.evaluation.statistics import wilson
+from fedvla_lib.policy import model, prefix_cache
+from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.training import local_train
+from report import laptop, options, recording, report, start
 
 
 def main() -> None:
@@ -32,10 +35,12 @@ def main() -> None:
 def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: int) -> dict[str, object]:
     """Train the base on the demonstrations of one task and let it act."""
     episodes = sorted(store.episodes.episode_id[store.episodes.task == task])
-    bundle = model.load_policy(config, data.episode_stats(store, episodes))
-    batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=config.seed)
-    result = local_train(bundle, prefix.stored(bundle, batches), config, steps=steps, progress=False)
-    actor = model.PolicyActor(bundle, config.seed)
+    bundle = model.load_policy(config, normalisation.episode_stats(store, episodes))
+    batches = Batches(store, episodes, config.chunk_size, config.batch_size, seed=config.seed)
+    result = local_train(
+        bundle, prefix_cache.with_cached_prefixes(bundle, batches), config, steps=steps, progress=False
+    )
+    actor = PolicyActor(bundle, config.seed)
     attempts = evaluate(actor, [task], rollout_seeds(rollouts), image_size=config.image_size, progress=False)
     successes = sum(attempt["success"] for attempt in attempts)
     low, high = wilson(successes, rollouts)

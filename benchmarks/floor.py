@@ -7,11 +7,13 @@ multiplies matrices that fit into its cache: about what a step would take if it 
 """
 
 import torch
-from report import laptop, median_seconds, options, recording, report, start
 from torch.utils.flop_counter import FlopCounterMode
 
-from fedvla_lib import data, model, prefix
-from fedvla_lib.train import flow_loss, local_train
+from fedvla_lib.data import normalisation
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.policy import model, prefix_cache
+from fedvla_lib.policy.training import flow_loss, local_train
+from report import laptop, median_seconds, options, recording, report, start
 
 STEPS = 10  # of each measurement of a training
 SIDE = 512  # of the matrices multiplied to find the machine's rate: they fit into a core's own cache
@@ -24,9 +26,9 @@ def main() -> None:
     torch.set_num_threads(1)
     store = recording(config)
     episodes = list(store.episodes.episode_id)
-    batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
-    bundle = model.load_policy(config, data.episode_stats(store, episodes))
-    kept = prefix.stored(bundle, batches)
+    batches = Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
+    bundle = model.load_policy(config, normalisation.episode_stats(store, episodes))
+    kept = prefix_cache.with_cached_prefixes(bundle, batches)
     rate = operations_per_second(chosen.repeats)
     rows = []
     for name, supply in {"stored prefix": kept, "whole model, frozen prefix": batches}.items():

@@ -12,14 +12,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pandas as pd
-from report import cores, laptop, options, report, start
 
-from fedvla_lib import arms, data
-from fedvla_lib.compare import paired_difference, success_table
 from fedvla_lib.config import Config, task_names
-from fedvla_lib.evaluate import FIRST_SEED, evaluate, rollout_seeds
-from fedvla_lib.model import Bundle, PolicyActor
-from fedvla_lib.run_folder import write_json
+from fedvla_lib.data import recordings
+from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
+from fedvla_lib.evaluation.statistics import paired_difference, success_table
+from fedvla_lib.experiments import methods
+from fedvla_lib.files import write_json
+from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.model import Bundle
+from report import cores, laptop, options, report, start
 
 STARTS_FROM = FIRST_SEED + 1000  # apart from the starting positions of the chapters
 BEST = "best client alone"
@@ -32,7 +34,7 @@ def main() -> None:
     parser.add_argument("--rollouts", type=int, default=20, help="attempts at each task, for each model and seed")
     parser.add_argument("--threads", type=int, default=cores(), help="threads that a model computes on")
     chosen = parser.parse_args()
-    recording = data.resolve(laptop(chosen.profile))
+    recording = recordings.resolve(laptop(chosen.profile))
     config = laptop(chosen.profile, num_threads=chosen.threads, data=str(recording))
     rows = pd.concat([one_seed(config, seed, chosen) for seed in chosen.seeds], ignore_index=True)
     report("four_arms", summary(rows), chosen.out)
@@ -41,7 +43,7 @@ def main() -> None:
 def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
     """Return a row for each attempt of each model of a run."""
     config = replace(config, seed=seed)
-    run = arms.federated(config)
+    run = methods.federated(config)
     kept = chosen.out / "four_arms" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
     if not kept.is_file():
         starts = rollout_seeds(chosen.rollouts, first=STARTS_FROM)
@@ -59,10 +61,10 @@ def attempts(name: str, bundle: Bundle, config: Config, starts: list[int]) -> li
 
 def models(config: Config) -> Iterator[tuple[str, Bundle]]:
     """Yield every model that is compared, with its name."""
-    yield "federated", arms.federated_policy(config)
-    yield "centralized", arms.centralized(config)
+    yield "federated", methods.federated_policy(config)
+    yield "centralized", methods.centralized(config)
     for client in range(config.num_clients):
-        yield f"client_{client} alone", arms.local_only(config, client)
+        yield f"client_{client} alone", methods.local_only(config, client)
 
 
 def summary(rows: pd.DataFrame) -> list[dict[str, object]]:

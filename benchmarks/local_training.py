@@ -12,14 +12,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
-from report import laptop, options, recording, report, start, timed
 
-from fedvla_lib import data, model, prefix
 from fedvla_lib.config import Config
-from fedvla_lib.record import REPO_ID
-from fedvla_lib.spec import ACTION_KEY, FPS
-from fedvla_lib.store import FrameStore
-from fedvla_lib.train import _optimizer as make_optimizer
+from fedvla_lib.data import normalisation
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.data.episode_writer import REPO_ID
+from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.policy import model, prefix_cache
+from fedvla_lib.policy.training import _optimizer as make_optimizer
+from fedvla_lib.robot.spec import ACTION_KEY, FPS
+from report import laptop, options, recording, report, start, timed
 
 
 def main() -> None:
@@ -32,13 +34,13 @@ def main() -> None:
     torch.set_num_threads(1)
     store = recording(config)
     episodes = list(store.episodes.episode_id)
-    batches = data.Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
-    stats = data.episode_stats(store, episodes)
+    batches = Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
+    stats = normalisation.episode_stats(store, episodes)
 
     ours = model.load_policy(config, stats)
     with tempfile.TemporaryDirectory() as fresh:  # what an earlier run has stored would cost nothing
-        stored_s = timed(lambda: prefix.ensure_prefixes(ours, store, Path(fresh), progress=False))
-    supply = prefix.stored(ours, batches)
+        stored_s = timed(lambda: prefix_cache.ensure_prefixes(ours, store, Path(fresh), progress=False))
+    supply = prefix_cache.with_cached_prefixes(ours, batches)
     our_losses, our_s = train(ours, config, (supply.at(step) for step in range(chosen.steps)), chosen.steps)
     samples = chosen.steps * config.batch_size
     rows = []
@@ -80,8 +82,8 @@ def one_step(
     settings = bundle.policy.config
     noise = torch.randn((len(batch["task"]), settings.chunk_size, settings.max_action_dim), generator=generator)
     times = torch.rand(len(noise), generator=generator)
-    if prefix.PREFIX_KEY in batch:
-        loss = prefix.prefix_loss(bundle, batch, noise, times)
+    if prefix_cache.PREFIX_KEY in batch:
+        loss = prefix_cache.prefix_loss(bundle, batch, noise, times)
     else:
         loss = bundle.policy.forward(bundle.preprocess(batch), noise=noise, time=times)[0]
     optimizer.zero_grad(set_to_none=True)
@@ -93,7 +95,7 @@ def one_step(
     return loss.item()
 
 
-def lerobot_batches(store: FrameStore, batches: data.Batches, steps: int, workers: int) -> torch.utils.data.DataLoader:
+def lerobot_batches(store: FrameStore, batches: Batches, steps: int, workers: int) -> torch.utils.data.DataLoader:
     """LeRobot's own way to the same batches: decode the frames when they are asked for."""
     chunk = [step / FPS for step in range(batches.chunk_size)]
     dataset = LeRobotDataset(REPO_ID, root=store.root, delta_timestamps={ACTION_KEY: chunk}, video_backend="pyav")

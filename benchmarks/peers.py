@@ -14,9 +14,8 @@ from argparse import Namespace
 from pathlib import Path
 
 from control_steps import seconds_per_step
+from fedvla_lib.robot.sim import So100Env
 from report import laptop, options, report, start
-
-from fedvla_lib.sim import So100Env
 
 # What a peer's process does: make the environment, rest, and print seconds per step of control.
 TIMING = """

@@ -5,11 +5,11 @@
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
-from report import laptop, median_seconds, options, recording, report, start
 
-from fedvla_lib import data
-from fedvla_lib.record import REPO_ID
-from fedvla_lib.spec import ACTION_KEY, FPS
+from fedvla_lib.data import batches
+from fedvla_lib.data.episode_writer import REPO_ID
+from fedvla_lib.robot.spec import ACTION_KEY, FPS
+from report import laptop, median_seconds, options, recording, report, start
 
 
 def main() -> None:
@@ -22,7 +22,7 @@ def main() -> None:
     chunk = [step / FPS for step in range(config.chunk_size)]
     dataset = LeRobotDataset(REPO_ID, root=store.root, delta_timestamps={ACTION_KEY: chunk}, video_backend="pyav")
     rows = np.random.default_rng(0).permutation(store.num_frames)[: chosen.frames]
-    ours_s = median_seconds(lambda: data.frames(store, rows, config.chunk_size), chosen.repeats) / len(rows)
+    ours_s = median_seconds(lambda: batches.batch_of_rows(store, rows, config.chunk_size), chosen.repeats) / len(rows)
     theirs_s = median_seconds(lambda: [dataset[int(row)] for row in rows], chosen.repeats) / len(rows)
     result = {"ours [ms/frame]": 1e3 * ours_s, "lerobot [ms/frame]": 1e3 * theirs_s, "ratio": theirs_s / ours_s}
     report("random_access", [result | {"frames": len(rows), "repeats": chosen.repeats}], chosen.out)

@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from fedvla_lib import data
-from fedvla_lib.cli import EXPECTED
+from fedvla_lib.cli.main import EXPECTED
 from fedvla_lib.config import Config, from_profile
-from fedvla_lib.run_folder import write_json
-from fedvla_lib.store import FrameStore, open_store
+from fedvla_lib.data import recordings
+from fedvla_lib.data.frame_store import FrameStore, open_store
+from fedvla_lib.files import write_json
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -43,7 +43,7 @@ def start(main: Callable[[], None]) -> None:
 
 def recording(config: Config) -> FrameStore:
     """Return the frames of the profile's own recording, made now if it is not in the cache."""
-    return open_store(data.resolve(config), image_size=config.image_size)
+    return open_store(recordings.resolve(config), image_size=config.image_size)
 
 
 def laptop(profile: str, **overrides: object) -> Config:

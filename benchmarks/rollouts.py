@@ -18,11 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from report import cores, laptop, options, report, start, timed
 
-from fedvla_lib import evaluate, model
 from fedvla_lib.config import Config
-from fedvla_lib.evaluate import FIRST_SEED
+from fedvla_lib.evaluation import rollouts
+from fedvla_lib.evaluation.rollouts import FIRST_SEED
+from fedvla_lib.policy import model
+from fedvla_lib.policy.actor import PolicyActor
+from report import cores, laptop, options, report, start, timed
 
 FILMS = 10  # what lerobot-eval films, whatever it is told
 AS_LEROBOT = "as-lerobot-eval"  # first argument with which this script calls itself to run lerobot-eval
@@ -34,12 +36,12 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, required=True, help="a saved policy")
     parser.add_argument("--task", default="lift", help="the task")
     parser.add_argument("--rollouts", type=int, default=96, help="attempts of each side")
-    parser.add_argument("--batch", type=int, default=evaluate.AT_ONCE, help="environments lerobot-eval runs at once")
+    parser.add_argument("--batch", type=int, default=rollouts.AT_ONCE, help="environments lerobot-eval runs at once")
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
     torch.set_num_threads(1)
     rows: list[dict] = []
-    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, evaluate.rollout_seeds(chosen.rollouts))))
+    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, rollouts.rollout_seeds(chosen.rollouts))))
     report("rollouts", [compared(chosen, config, rows, ours_s, own) for own in (False, True)], chosen.out)
 
 
@@ -61,7 +63,7 @@ def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float,
     }
 
 
-class SameNoise(model.PolicyActor):
+class SameNoise(PolicyActor):
     """A policy that draws the same noise in every episode."""
 
     def reset(self, env: Any, seed: int) -> None:
@@ -73,7 +75,7 @@ def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
     """Load the policy and roll out, as the command line does."""
     actor = SameNoise(model.load_policy(config))
     with tempfile.TemporaryDirectory() as films:
-        return evaluate.evaluate(
+        return rollouts.evaluate(
             actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), films=FILMS, progress=False
         )
 
@@ -83,7 +85,7 @@ def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes:
     command = [
         sys.executable, __file__, AS_LEROBOT, f"--policy.path={chosen.policy}",
         "--policy.device=cpu", "--env.type=so100_sim", f"--env.task={chosen.task}",
-        f"--env.image_size={config.image_size}", "--env.discover_packages_path=fedvla_lib.lerobot_env",
+        f"--env.image_size={config.image_size}", "--env.discover_packages_path=fedvla_lib.robot.lerobot_env",
         f"--eval.n_episodes={chosen.rollouts}", f"--eval.batch_size={chosen.batch}", f"--seed={FIRST_SEED}",
         f"--eval.use_async_envs={str(own_processes).lower()}", f"--output_dir={folder / 'out'}",
     ]  # fmt: skip

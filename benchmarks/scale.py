@@ -22,14 +22,15 @@ import pandas as pd
 import psutil
 from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from fedvla_lib.config import Config, task_names
+from fedvla_lib.data import recordings
+from fedvla_lib.engines import inline, simulation
+from fedvla_lib.run_folder import GLOBAL, read_events
 from report import laptop, machine, options, report, start
 
-from fedvla_lib import data, engine, superlink
-from fedvla_lib.config import Config, task_names
-from fedvla_lib.run_folder import GLOBAL, read_events
-
 MARK = "FEDVLA_BENCHMARK"  # in the environment of every process of one measurement
-ENGINES = {"inline": engine.run_inline, "simulation": superlink.run_simulation}
+ENGINES = {"inline": inline.run_inline, "simulation": simulation.run_simulation}
 MERGED_AT_ONCE = 6
 PER_CLIENT, RATIO = "later, per client [ms]", "against fewer clients"
 
@@ -80,7 +81,7 @@ def compared(rows: list[dict[str, object]]) -> list[dict[str, object]]:
 
 def repeated(config: Config, count: int, folder: Path) -> Path:
     """Write a data set that repeats the profile's recording until `count` clients have an episode to train on."""
-    path, k = Path(data.resolve(config)), 0
+    path, k = Path(recordings.resolve(config)), 0
     wanted = count + len(task_names(config))  # of each task one is held out
     while (have := LeRobotDataset("local/part", root=path)).num_episodes < wanted:
         times = min(MERGED_AT_ONCE, -(-wanted // have.num_episodes))

@@ -70,25 +70,6 @@ class Config:
     resume: str = ""  # run folder of an interrupted run to go on with; empty starts a new one
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """What decides the nano base; the defaults made the one that comes with the package."""
-
-    scenes: int = 10_000  # rendered scenes to learn from what words mean
-    unseen_scenes: int = 500  # further ones, on which pointing is measured
-    grounding_steps: int = 2500  # optimiser steps on them, of the vision-language part
-    steps: int = 5000  # optimiser steps of the action expert
-    episodes_per_task: int = 150  # demonstrations of each pretraining task
-    image_size: int = 96  # side of the square camera images in pixels
-    batch_size: int = 32  # scenes or samples per optimiser step
-    lr: float = 1e-3  # peak learning rate of AdamW
-    jitter: float = 1.0  # spread of cameras, light and colours from scene to scene
-    rollouts: int = 50  # attempts at each task when the base is measured
-    checkpoint_every: int = 500  # steps between checkpoints
-    num_threads: int = 1  # torch threads
-    seed: int = 7_000_000  # fixes all of it; far from the seeds of runs
-
-
 PROFILES: dict[str, dict[str, Any]] = {
     "tiny": {
         "episodes_per_task": 4,
@@ -169,11 +150,6 @@ def granted_threads(config: Config) -> int:
     return config.num_threads or cores
 
 
-def cache_dir() -> Path:
-    """Return where recordings, decoded frames and meshes are kept: ``$FEDVLA_CACHE``, else ``~/.cache/fedvla``."""
-    return Path(os.environ.get("FEDVLA_CACHE") or Path.home() / ".cache" / "fedvla")
-
-
 def check(config: Config) -> Config:
     """Return `config` if every value is usable, else raise ValueError naming the setting, the value and the range."""
     positive = (
@@ -222,3 +198,10 @@ def _cast(key: str, value: Any, kind: type) -> Any:
     if type(value) is not kind:
         raise ValueError(f"{key.replace('_', '-')}={value!r} has type {type(value).__name__}: give {kind.__name__}")
     return value
+
+
+def absolute(config: Config) -> Config:
+    """Return settings with absolute paths: Flower's processes choose their own working directory. Hub ids stay."""
+    paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
+    found = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
+    return replace(config, out=str(Path(config.out).resolve()), **found)

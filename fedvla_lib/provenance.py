@@ -2,11 +2,22 @@
 
 import ast
 import hashlib
+import json
+import os
+import platform
+import shutil
+import subprocess
 from collections.abc import Callable
+from dataclasses import asdict
+from datetime import datetime
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fedvla_lib.config import Config
+
+PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
 LIBRARY = Path(__file__).parent
 
 
@@ -65,3 +76,62 @@ class _WithoutWords(ast.NodeTransformer):
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
         return None if is_text else self.generic_visit(node)
+
+
+def config_hash(config: Config) -> str:
+    """Return a short hash of what a run computes: all settings except where it writes and how many threads it uses."""
+    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def first_stamp(config: Config, engine: str) -> dict[str, Any]:
+    """Return what is known of a run when it starts: commit, settings, versions, hardware."""
+    return {
+        "status": "running",
+        "engine": engine,
+        "started": now(),
+        "wall_s": None,
+        "commit": _commit(),
+        "config_hash": config_hash(config),
+        "seed": config.seed,
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in PACKAGES},
+        "hardware": _hardware(config),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None  # inside a Flower app bundle this library runs without being installed
+
+
+def _hardware(config: Config) -> dict[str, Any]:
+    return {
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "cores": os.cpu_count(),
+        "device": config.device,
+        "memory_gb": _memory_gb(),
+    }
+
+
+def _memory_gb() -> float | None:
+    if not hasattr(os, "sysconf"):
+        return None
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+
+
+def _commit() -> str | None:
+    """The commit of the checkout this library lies in, with + when tracked files differ; None outside a checkout."""
+    if shutil.which("git") is None:
+        return None
+    here = Path(__file__).parent
+    command = ["git", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
+    described = subprocess.run(command, cwd=here, capture_output=True, text=True)
+    return described.stdout.strip() or None
+
+
+def now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="milliseconds")

@@ -13,32 +13,28 @@ Whole files appear by rename, events by one append each, so a run that is killed
 Who writes to a run holds a lock in its folder, which the system releases however that process ends.
 """
 
-import hashlib
 import json
-import math
-import os
-import platform
 import shutil
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from filelock import FileLock, Timeout
 
+from fedvla_lib import provenance
 from fedvla_lib.config import Config, check
+from fedvla_lib.files import as_json, write_atomically, write_json
+from fedvla_lib.provenance import config_hash, first_stamp, now
 
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
 GLOBAL = "global"
 LOCK = ".lock"
 PATIENCE_S = 1.0  # with a lock that another process may hold only to see whether it is free
-PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class RunFolder:
 
     def log(self, round_number: int, who: str, kind: str, values: dict[str, Any]) -> None:
         """Append one event: `who` is ``global`` or a client's name, `kind` says what the values are."""
-        event = {"round": round_number, "who": who, "kind": kind, "time": _now(), "values": _plain(values)}
+        event = {"round": round_number, "who": who, "kind": kind, "time": now(), "values": as_json(values)}
         with open(self.root / "metrics.jsonl", "ab", buffering=0) as file:
             file.write((json.dumps(event, allow_nan=False) + "\n").encode())
 
@@ -199,24 +195,6 @@ def counted_steps(root: Path) -> dict[str, int] | None:
     return {"in_all": int(trained.steps.sum()), "in_a_row": int(trained.groupby("round").steps.max().sum())}
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write `content` as readable JSON, whole or not at all."""
-    write_atomically(path, (json.dumps(_plain(content), indent=2) + "\n").encode())
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file beside its place and move it there."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
-
-
-def config_hash(config: Config) -> str:
-    """Return a short hash of what a run computes: all settings except where it writes and how many threads it uses."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
-
-
 def _make_folder(out: Path) -> Path:
     """Two runs in one second get two names: the later takes the next free second."""
     when = datetime.now()
@@ -230,55 +208,6 @@ def _make_folder(out: Path) -> Path:
         except OSError as error:
             message = f"cannot make the run folder {path} ({error.strerror}): give a writable folder as out"
             raise ValueError(message) from error
-
-
-def first_stamp(config: Config, engine: str) -> dict[str, Any]:
-    """Return what is known of a run when it starts: commit, settings, versions, hardware."""
-    return {
-        "status": "running",
-        "engine": engine,
-        "started": _now(),
-        "wall_s": None,
-        "commit": _commit(),
-        "config_hash": config_hash(config),
-        "seed": config.seed,
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
-        "hardware": _hardware(config),
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None  # inside a Flower app bundle this library runs without being installed
-
-
-def _hardware(config: Config) -> dict[str, Any]:
-    return {
-        "machine": platform.machine(),
-        "system": platform.system(),
-        "cores": os.cpu_count(),
-        "device": config.device,
-        "memory_gb": _memory_gb(),
-    }
-
-
-def _memory_gb() -> float | None:
-    if not hasattr(os, "sysconf"):
-        return None
-    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-
-
-def _commit() -> str | None:
-    """The commit of the checkout this library lies in, with + when tracked files differ; None outside a checkout."""
-    if shutil.which("git") is None:
-        return None
-    here = Path(__file__).parent
-    command = ["git", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
-    described = subprocess.run(command, cwd=here, capture_output=True, text=True)
-    return described.stdout.strip() or None
 
 
 def read_events(path: Path) -> list[dict[str, Any]]:
@@ -300,15 +229,17 @@ def _event(path: Path, number: int, line: str) -> dict[str, Any]:
         raise ValueError(f"{path} line {number} is not an event: {error.msg}") from error
 
 
-def _plain(value: Any) -> Any:
-    """Make `value` valid JSON: NumPy scalars become numbers, numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    value = value.item() if hasattr(value, "item") else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def run_folders(config: Config) -> set[Path]:
+    """Return the run folders there are where `config` writes."""
+    return {stamp.parent for stamp in Path(config.out).glob("*/stamp.json")}
 
 
-def _now() -> str:
-    return datetime.now().astimezone().isoformat(timespec="milliseconds")
+def own_run(config: Config, before: set[Path]) -> Path | None:
+    """Return the folder that a run writes: the one to be resumed, or the newest with its settings not in `before`.
+
+    Others may write to the same place meanwhile. None: it has not begun.
+    """
+    if config.resume:
+        return Path(config.resume)
+    wanted, new = provenance.config_hash(config), run_folders(config) - before
+    return max((r for r in new if provenance.config_hash(read_config(r)) == wanted), default=None)

@@ -47,15 +47,15 @@ def wait_for_interrupted(root: Path) -> None:
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Flower's engines run the ClientApp of `faulty.py` in place of the library's."""
-    from fedvla_lib import superlink
+    from fedvla_lib.engines import app_bundle, superlink
 
-    stage = superlink.stage_app
+    stage = app_bundle.stage_app
 
     def stage_faulty(folder: Path) -> Path:
         app = stage(folder)
         shutil.copy(Path(__file__).with_name("faulty.py"), app)
         project = app / "pyproject.toml"
-        told = project.read_text().replace("fedvla_lib.client_app:app", "faulty:app")
+        told = project.read_text().replace("fedvla_lib.federation.client_app:app", "faulty:app")
         project.write_text(told.replace("fab-include = [", 'fab-include = ["faulty.py", '))
         return app
 
@@ -65,10 +65,11 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
 def assert_faults_were_survived(root: Path, config) -> None:
     """A run of the faulty app left out what was wrong, by name and reason, and ended as on the inline engine."""
     import numpy as np
-    from faulty import app
     from safetensors.numpy import load_file
 
-    from fedvla_lib import engine, run_folder
+    from faulty import app
+    from fedvla_lib import run_folder
+    from fedvla_lib.engines.inline import run_inline
 
     rejected, trained = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train"))
     found = rejected[["round", "who", "to", "reason"]].values.tolist()
@@ -76,7 +77,7 @@ def assert_faults_were_survived(root: Path, config) -> None:
     assert "no space left on device" in rejected.detail[0]
     everybody = {f"client_{k}" for k in range(config.num_clients)}
     assert trained.groupby("round").who.agg(set).tolist() == [everybody - {"client_0"}, everybody - {"client_1"}]
-    inline = engine.run_inline(config, clients_app=app, progress=False)
+    inline = run_inline(config, clients_app=app, progress=False)
     left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
     assert left.keys() == right.keys() and max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
 
@@ -111,7 +112,7 @@ def one_thread() -> None:
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real recording of 3 tasks x 4 episodes at 64 pixels, made once. Copy it before damaging it."""
-    from fedvla_lib.record import record
+    from fedvla_lib.data.record import record
 
     root = tmp_path_factory.mktemp("recording") / "data"
     return record(TASKS, EPISODES_PER_TASK, root, image_size=IMAGE_SIZE, progress=False)
@@ -120,6 +121,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def store(recording: Path):
     """The frames of `recording`."""
-    from fedvla_lib.store import open_store
+    from fedvla_lib.data.frame_store import open_store
 
     return open_store(recording, image_size=IMAGE_SIZE, progress=False)

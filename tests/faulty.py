@@ -5,23 +5,23 @@ Tests put this file into the app that Flower's engines run, and pass its app to 
 
 import numpy as np
 
-from fedvla_lib import client_app, wire
-from fedvla_lib.params import digest
+from fedvla_lib.federation import client_app, messages
+from fedvla_lib.policy.parameters import digest
 
 
 def fault(message, context, call_next):
     """Around a handler; the hash is that of what is sent."""
-    reply, who = call_next(message, context), context.node_config[wire.PARTITION]
+    reply, who = call_next(message, context), context.node_config[messages.PARTITION]
     if message.metadata.message_type != "train":
         return reply
-    match message.content[wire.CONFIG][wire.ROUND], who:
+    match message.content[messages.CONFIG][messages.ROUND], who:
         case 1, 0:
             raise OSError("no space left on device")
         case 2, 1:
-            trained = wire.unpack_arrays(reply.content[wire.ARRAYS])
+            trained = messages.unpack_arrays(reply.content[messages.ARRAYS])
             arrays = {name: array * np.float32("nan") for name, array in trained.items()}
-            reply.content[wire.ARRAYS] = wire.pack_arrays(arrays)
-            reply.content[wire.NOTE] = wire.note(sha256=digest(arrays))
+            reply.content[messages.ARRAYS] = messages.pack_arrays(arrays)
+            reply.content[messages.NOTE] = messages.make_note(sha256=digest(arrays))
     return reply
 
 

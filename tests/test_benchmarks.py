@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from fedvla_lib import model
 from fedvla_lib.config import from_profile
+from fedvla_lib.policy import model
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import build_book
 import nbformat
 import pytest
 import yaml
-from build_book import BookError, Chapter
 
-from fedvla_lib import results
+import build_book
+from build_book import BookError, Chapter
+from fedvla_lib.experiments import results
 
 ROOT = Path(__file__).parent.parent
 CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"
@@ -46,7 +46,7 @@ def project(tmp_path) -> Path:
 @pytest.mark.unit
 def test_key_changes_with_everything_a_chapter_depends_on(project):
     keys = {build_book.library_key(project, profile) for profile in ("tiny", "laptop")}
-    for path, text in (("fedvla_lib/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
+    for path, text in (("fedvla_lib/robot/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
         (project / path).write_text(text)
         keys.add(build_book.library_key(project, "tiny"))
     (project / "fedvla_lib" / "new.py").write_text("")
@@ -246,7 +246,7 @@ def test_the_front_page_says_what_the_stored_comparison_found():
     assert f"the federated model {100 * rows.success.mean():.1f} % [" in said
     assert f"{len(rows):,} attempts over {rows.run.nunique()} training seeds" in said
     assert set(stored.partition) <= set(build_book.DEALT)
-    gaps = results.differences(results.lend(stored), [("fedavg-200x2x2", "centralized")], seed=0)
+    gaps = results.differences(results.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
         words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
         assert words in said and said.count(" points [") == len(gaps)

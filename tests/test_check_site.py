@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-import check_site
 import imageio.v3 as iio
 import numpy as np
 import pytest
+
+import check_site
 import site_scripts
 
 PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>A page</title>

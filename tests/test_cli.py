@@ -12,19 +12,21 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from conftest import heed_interrupts
 
-from fedvla_lib import cli
-from fedvla_lib.cli import build_parser, main, settings
+from conftest import heed_interrupts
+from fedvla_lib.cli import commands
+from fedvla_lib.cli.commands import settings
+from fedvla_lib.cli.main import main
+from fedvla_lib.cli.parser import build_parser
 from fedvla_lib.config import Config, from_profile, from_run_config
-from fedvla_lib.results import P_VALUES
+from fedvla_lib.experiments.results import P_VALUES
 
 COMMANDS = ["doctor", "record", "pretrain", "experts", "config", "train", "run", "evaluate"]
 
 
 @pytest.mark.unit
 def test_no_table_shows_a_p_value_of_zero(capsys):
-    cli._print_table(pd.DataFrame({"difference": [0.00041], **dict.fromkeys(P_VALUES, [4e-7])}))
+    commands._print_table(pd.DataFrame({"difference": [0.00041], **dict.fromkeys(P_VALUES, [4e-7])}))
     assert capsys.readouterr().out.splitlines()[1].split() == ["0.000", *["<", "0.001"] * len(P_VALUES)]
 
 

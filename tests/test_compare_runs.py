@@ -7,9 +7,11 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from fedvla_lib import compare_runs, engine, run_folder
-from fedvla_lib.cli import main
+from fedvla_lib import run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile
+from fedvla_lib.engines import inline
+from fedvla_lib.evaluation import compare_runs
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
@@ -24,7 +26,7 @@ def runs(recording, tmp_path_factory):
     settings = {"fedavg": {}, "median": {"strategy": "fedmedian"}, "longer": {"local_steps": 3}}
     folders = {}
     for name, own in settings.items():
-        made = engine.run_inline(replace(tiny, out=str(out), **own), progress=False)
+        made = inline.run_inline(replace(tiny, out=str(out), **own), progress=False)
         folders[name] = made.rename(out / name)
     return folders
 

@@ -5,17 +5,17 @@ from dataclasses import fields, replace
 
 import pytest
 
-from fedvla_lib.cli import setting_texts
+from fedvla_lib.cli.parser import setting_texts
 from fedvla_lib.config import (
     PROFILES,
     Config,
-    cache_dir,
     from_profile,
     from_run_config,
     granted_threads,
     task_names,
     to_run_config,
 )
+from fedvla_lib.files import cache_dir
 
 pytestmark = pytest.mark.unit
 

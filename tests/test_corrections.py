@@ -6,14 +6,16 @@ import torch
 from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
-from fedvla_lib import strategies, wire
-from fedvla_lib.checkpoint import flat, nested
-from fedvla_lib.client_app import correction_for, hand_in
 from fedvla_lib.config import Config
-from fedvla_lib.corrections import ControlVariates, Proximal
-from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
-from fedvla_lib.params import digest
-from fedvla_lib.roster import Roster
+from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid, claim_identity
+from fedvla_lib.federation import messages
+from fedvla_lib.federation.checkpoint import flat, nested
+from fedvla_lib.federation.client_app import attach_control_variates, correction_for
+from fedvla_lib.federation.nodes import Roster
+from fedvla_lib.federation.strategies import build
+from fedvla_lib.federation.strategies.fedprox import Proximal
+from fedvla_lib.federation.strategies.scaffold import ControlVariates
+from fedvla_lib.policy.parameters import digest
 
 pytestmark = pytest.mark.unit
 CURVATURE, TARGET = (4.0, 1.0), (-1.0, 2.0)  # client k minimises CURVATURE[k] / 2 (w - TARGET[k])^2
@@ -47,14 +49,16 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
     @app.train()
     def train(message: Message, context: Context) -> Message:
         k = context.node_config["partition-id"]
-        weight = parameter(wire.unpack_arrays(message.content[wire.ARRAYS])["w"])
+        weight = parameter(messages.unpack_arrays(message.content[messages.ARRAYS])["w"])
         correction = correction_for(message, context, {"w": weight})
         local_phase(weight, k, correction)
         arrays = {"w": weight.detach().numpy()}
-        metrics = MetricRecord({wire.EXAMPLES: examples[k], "loss": 0.0, "seconds": 0.0})
-        note = wire.note(sha256=digest(arrays))
-        reply = RecordDict({wire.ARRAYS: wire.pack_arrays(arrays), wire.METRICS: metrics, wire.NOTE: note})
-        hand_in(reply, correction, context)
+        metrics = MetricRecord({messages.EXAMPLES: examples[k], "loss": 0.0, "seconds": 0.0})
+        note = messages.make_note(sha256=digest(arrays))
+        reply = RecordDict(
+            {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: metrics, messages.NOTE: note}
+        )
+        attach_control_variates(reply, correction, context)
         return Message(reply, reply_to=message)
 
     return app
@@ -64,7 +68,7 @@ def serving(grid, examples, share, rounds_done=0, **settings):
     """The strategy of these settings, for the two clients of the grid."""
     nodes = grid.get_node_ids()
     weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
-    return strategies.build(
+    return build.build_strategy(
         Config(**settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
         report=lambda *_: None, keep_rollouts=lambda *_: None, train_share=share, rounds_done=rounds_done,
     )  # fmt: skip
@@ -77,7 +81,7 @@ def federate(rounds, examples=(1, 1), share=1.0, replaced_after=0, **settings):
     """
     grid, done = InlineGrid(quadratic_app(examples), 2, {}, raise_errors=True), 0
     strategy = serving(grid, examples, share, **settings)
-    arrays, path = wire.pack_arrays({"w": np.zeros(1, np.float32)}), []
+    arrays, path = messages.pack_arrays({"w": np.zeros(1, np.float32)}), []
     for number in range(1, rounds + 1):
         if number - 1 == replaced_after > 0:
             kept, done = nested(flat(strategy.memory())), replaced_after
@@ -85,7 +89,7 @@ def federate(rounds, examples=(1, 1), share=1.0, replaced_after=0, **settings):
             strategy.remember(kept)
         replies = grid.send_and_receive(strategy.configure_train(number - done, arrays, ConfigRecord(), grid))
         arrays, _ = strategy.aggregate_train(number - done, replies)
-        path.append(float(wire.unpack_arrays(arrays)["w"][0]))
+        path.append(float(messages.unpack_arrays(arrays)["w"][0]))
     return path, strategy, grid.client_states()
 
 
@@ -159,7 +163,7 @@ def test_control_variates_sum_to_zero_over_clients():
 def test_what_the_server_adds_up_is_the_weighted_mean_of_what_clients_keep(examples, share):
     """So sum_k p_k (c_k - c) = 0, whoever was drawn: through the strategy and Flower's Context."""
     _, strategy, kept = federate(7, examples, share, strategy="scaffold")
-    own = [kept[f"{FIRST_NODE_ID + k}:{wire.CONTROL}"]["w"] for k in range(2)]
+    own = [kept[f"{FIRST_NODE_ID + k}:{messages.CONTROL}"]["w"] for k in range(2)]
     assert abs(own[0] - own[1]) > 0.1
     np.testing.assert_allclose(np.average(own, axis=0, weights=examples), strategy.control["w"], atol=1e-5)
 
@@ -253,15 +257,15 @@ def test_a_damaged_control_variate_is_rejected():
     grid = InlineGrid(app, 2, {}, raise_errors=True)
     nodes = grid.get_node_ids()
     seen = []
-    strategy = strategies.build(
+    strategy = build.build_strategy(
         Config(strategy="scaffold"), dict.fromkeys(nodes, 0.5), shapes={"w": (1,)},
         roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
         report=lambda _, who, kind, values: seen.append((who, kind, values.get("reason"))),
         keep_rollouts=lambda *_: None,
     )  # fmt: skip
-    start = wire.pack_arrays({"w": np.zeros(1, np.float32)})
+    start = messages.pack_arrays({"w": np.zeros(1, np.float32)})
     replies = grid.send_and_receive(strategy.configure_train(1, start, ConfigRecord(), grid))
-    replies[1].content[wire.CONTROL] = wire.pack_arrays({"w": np.full(1, np.nan, np.float32)})
+    replies[1].content[messages.CONTROL] = messages.pack_arrays({"w": np.full(1, np.nan, np.float32)})
     strategy.aggregate_train(1, replies)
     assert ("client_1", "rejected", "non-finite") in seen and ("client_0", "train", None) in seen
     assert strategy.control["w"] == pytest.approx(0.5 * FIRST_CONTROL)

@@ -5,12 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import keep_costs
 import nbformat
 import pytest
 from nbformat import v4
 
-from fedvla_lib import cost
+import keep_costs
+from fedvla_book import chapter_cost
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
@@ -26,10 +26,10 @@ def test_spent_adds_up_what_the_federations_exchanged_each_once(tmp_path):
     logged(tmp_path / "runs" / "one", to="train", sent_bytes=2_000_000, received_bytes=500_000)
     logged(tmp_path / "runs" / "two", to="train", sent_bytes=1_000_000, received_bytes=0)
     folders = [tmp_path / "runs", tmp_path / "runs" / "one"]
-    found = cost.spent(12.34, "tiny", 3, folders)
+    found = chapter_cost.spent(12.34, "tiny", 3, folders)
     assert found.exchanged_mb == 3.5 and found.seconds == 12.3
     assert "3.5 MB" in repr(found) and "profile tiny, seed 3" in repr(found).lower()
-    assert "exchanged" not in repr(cost.spent(1, "tiny", 0))
+    assert "exchanged" not in repr(chapter_cost.spent(1, "tiny", 0))
 
 
 HOLDS = """
@@ -51,7 +51,7 @@ def test_memory_is_the_most_that_was_held():
 
 def executed(folder, name, *, built=True, said=True):
     """An executed chapter as a build leaves it."""
-    data, metadata = cost.spent(5, "tiny", 0)._repr_mimebundle_()
+    data, metadata = chapter_cost.spent(5, "tiny", 0)._repr_mimebundle_()
     shown = v4.new_output("execute_result", data=data, metadata=metadata)
     cell = v4.new_code_cell("cost.spent()", outputs=[shown] if said else [])
     notebook = v4.new_notebook(cells=[cell], metadata={"fedvla": {"seconds": 7.5}} if built else {})
@@ -68,12 +68,12 @@ def test_what_a_build_measured_is_kept_and_shown(tmp_path):
         keep_costs.keep(tmp_path, "tiny")
     executed(folder, "02_b", said=False)
     kept = keep_costs.keep(tmp_path, "tiny")
-    shown = cost.measured("01_a", kept.parent)
+    shown = chapter_cost.measured("01_a", kept.parent)
     assert shown.loc["tiny", "time [s]"] == "8" and float(shown.loc["tiny", "memory [MB]"].replace(",", "")) > 10
     assert set(shown.loc["laptop"]) == {"–"}
     assert shown.to_html().split("</thead>")[0].count("<tr") == 1, "one row of heads, in a small box"
-    assert cost.measured("02_b", kept.parent).loc["tiny"].tolist()[:3] == ["8", "–", "–"]
-    assert set(cost.measured("03_c", kept.parent).to_numpy().ravel()) == {"–"}
+    assert chapter_cost.measured("02_b", kept.parent).loc["tiny"].tolist()[:3] == ["8", "–", "–"]
+    assert set(chapter_cost.measured("03_c", kept.parent).to_numpy().ravel()) == {"–"}
 
 
 def test_a_copy_that_no_build_made_is_refused(tmp_path):

@@ -9,8 +9,12 @@ import torch
 from lerobot.datasets import LeRobotDataset
 
 from fedvla_lib.config import from_profile
-from fedvla_lib.data import Batches, episode_stats, frame_rows, frames, open_store, pool_stats, resolve, split
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
+from fedvla_lib.data.batches import Batches, batch_of_rows, frame_rows
+from fedvla_lib.data.frame_store import open_store
+from fedvla_lib.data.normalisation import episode_stats, pool_stats
+from fedvla_lib.data.recordings import resolve
+from fedvla_lib.data.splits import split
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
 CHUNK = 8
 
@@ -102,7 +106,7 @@ def test_a_sample_is_what_lerobot_gives_for_delta_timestamps(recording, store):
     dataset = LeRobotDataset("fedvla/test", root=recording, delta_timestamps=deltas, video_backend="pyav")
     ends = store.episodes["end"].to_numpy()
     rows = [0, 5, ends[0] - CHUNK, ends[0] - CHUNK + 1, ends[0] - 1, ends[0], ends[5] - 3, ends[-1] - 1]
-    batch = frames(store, rows, CHUNK)
+    batch = batch_of_rows(store, rows, CHUNK)
     for place, row in enumerate(rows):
         item = dataset[int(row)]
         assert torch.equal(batch[STATE_KEY][place], item[STATE_KEY])
@@ -116,7 +120,7 @@ def test_a_sample_is_what_lerobot_gives_for_delta_timestamps(recording, store):
 @pytest.mark.integration
 def test_chunks_end_with_their_episode(store):
     last = int(store.episodes["end"].iloc[0]) - 1
-    batch = frames(store, [last - 1], CHUNK)
+    batch = batch_of_rows(store, [last - 1], CHUNK)
     assert batch["action_is_pad"][0].tolist() == [False, False] + [True] * (CHUNK - 2)
     assert torch.equal(batch[ACTION_KEY][0, 1:], torch.from_numpy(store.actions[last]).expand(CHUNK - 1, 6))
 
@@ -172,7 +176,7 @@ def test_augmentation_changes_pictures_only_and_a_little(store):
 
 @pytest.mark.unit
 def test_a_shift_moves_the_picture_and_repeats_the_edge():
-    from fedvla_lib.data import _shift
+    from fedvla_lib.data.augmentation import _shift
 
     picture = np.tile(np.arange(50, dtype=np.uint8)[None, :, None, None], (6, 1, 50, 3))  # brightness = line
     shifted = _shift(picture, np.random.default_rng(0)).astype(int)

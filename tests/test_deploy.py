@@ -16,14 +16,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import IMAGE_SIZE, assert_faults_were_survived, heed_interrupts
 from cryptography import x509
 from flwr.app import RecordDict
 from safetensors.numpy import load_file
 
-from fedvla_lib import client_app, clients, credentials, deploy, engine, record, run_folder, superlink
-from fedvla_lib.cli import build_parser, main, settings
+from conftest import IMAGE_SIZE, assert_faults_were_survived, heed_interrupts
+from fedvla_lib import run_folder
+from fedvla_lib.cli.commands import settings
+from fedvla_lib.cli.main import main
+from fedvla_lib.cli.parser import build_parser
 from fedvla_lib.config import from_profile, to_run_config
+from fedvla_lib.data import record
+from fedvla_lib.engines import credentials, deployment, processes, superlink
+from fedvla_lib.engines.inline import run_inline
+from fedvla_lib.federation import client, client_app
+from fedvla_lib.files import write_json
 
 ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
@@ -56,19 +63,19 @@ def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_
     tiny = replace(tiny, **KEEPING)
     other = record.record(["lift"], 3, tmp_path / "other", image_size=IMAGE_SIZE, seed=5, progress=False)
     own, said = [recording, other], []
-    root = deploy.run_deployed(tiny, tls=True, auth=True, data=own, timeout_s=540, say=said.append)
+    root = deployment.run_deployed(tiny, tls=True, auth=True, data=own, timeout_s=540, say=said.append)
     assert run_folder.read_stamp(root)["status"] == "completed"
     assert run_folder.read_metrics(root, "rejected").empty
     assert any("round 2, client_1, train: loss" in line for line in said)
     inline, forgetful = (
-        engine.run_inline(tiny, clients_app=app, data=own, progress=False, raise_errors=True)
+        run_inline(tiny, clients_app=app, data=own, progress=False, raise_errors=True)
         for app in (None, client_app.build(mods=[forget]))
     )
     deployed, kept, forgotten = (
         load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline, forgetful)
     )
     assert apart(deployed, kept) <= 1e-6 and apart(deployed, forgotten) > 1e-4
-    held = {f"client_{k}": clients.open_client(tiny, k, own_data=str(path)).num_examples for k, path in enumerate(own)}
+    held = {f"client_{k}": client.open_client(tiny, k, own_data=str(path)).num_examples for k, path in enumerate(own)}
     trained = run_folder.read_metrics(root, "train")
     assert held["client_0"] != held["client_1"]  # all of the data set that each was given
     assert all(held[who] == frames for who, frames in zip(trained.who, trained.num_examples, strict=True))
@@ -77,35 +84,35 @@ def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory):
     """A deployment of two clients that the tests below meet."""
-    with deploy.deployment(tmp_path_factory.mktemp("deployment"), 2, tls=True, auth=True) as here:
+    with deployment.running_deployment(tmp_path_factory.mktemp("deployment"), 2, tls=True, auth=True) as here:
         yield here
 
 
 def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
     stranger = credentials.make_node_key(tmp_path, "stranger")
     intruder = replace(standing, keys=[stranger, stranger], nodes={}, folder=tmp_path)
-    with pytest.raises(superlink.FlowerRunError, match=r"SuperNode of client 0 ended with status [1-9]"):
+    with pytest.raises(processes.FlowerRunError, match=r"SuperNode of client 0 ended with status [1-9]"):
         intruder.start_node(0)
-    assert deploy.CONNECTED not in intruder.log(0).read_text()
+    assert deployment.CONNECTED not in intruder.log(0).read_text()
 
 
-def refusal(node_of: deploy.Deployment) -> str:
+def refusal(node_of: deployment.Deployment) -> str:
     """Start a SuperNode of the deployment, which has to refuse the server at once, and return its log."""
-    with pytest.raises(superlink.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
+    with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
         node_of.start_node(0)
-    superlink.stop(node_of.nodes[0])
+    processes.stop(node_of.nodes[0])
     return node_of.log(0).read_text()
 
 
 def test_nodes_and_users_that_trust_another_authority_do_not_talk_to_the_server(standing, tmp_path):
     elsewhere = credentials.make_server(tmp_path / "elsewhere")
     astray = replace(standing, link=replace(standing.link, files=elsewhere), nodes={}, folder=tmp_path)
-    assert deploy.CONNECTED not in refusal(astray)
+    assert deployment.CONNECTED not in refusal(astray)
     known = (standing.folder / "config.toml").read_text()
     assert str(standing.link.files.authority) in known
     (tmp_path / "config.toml").write_text(known.replace(str(standing.link.files.authority), str(elsewhere.authority)))
     user = replace(standing.link, environment=superlink.flower_environment(tmp_path))
-    with pytest.raises(superlink.FlowerRunError, match="flwr list failed"):
+    with pytest.raises(processes.FlowerRunError, match="flwr list failed"):
         user.ask("list", superlink.CONNECTION)
     assert "runs" in standing.link.ask("list", superlink.CONNECTION)  # of those who trust the right one
 
@@ -114,18 +121,18 @@ def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tm
     """By this library as well: here it is asked only whether somebody listens, so that the others can refuse."""
     expired = credentials.make_server(tmp_path / "server", until=datetime.now(UTC) - timedelta(hours=1))
     checked = superlink.answers
-    monkeypatch.setattr(superlink, "answers", lambda port, files: not superlink.is_free(port))
+    monkeypatch.setattr(superlink, "answers", lambda port, files: not processes.is_free(port))
     with superlink.local_superlink(tmp_path, files=expired) as link:
         assert not checked(link.port, expired)
-        said = refusal(deploy.Deployment(link, tmp_path, [], [], 1))
-        assert "certificate has expired" in said and deploy.CONNECTED not in said
-        with pytest.raises(superlink.FlowerRunError, match="flwr list failed"):  # Flower's command does not say why
+        said = refusal(deployment.Deployment(link, tmp_path, [], [], 1))
+        assert "certificate has expired" in said and deployment.CONNECTED not in said
+        with pytest.raises(processes.FlowerRunError, match="flwr list failed"):  # Flower's command does not say why
             link.ask("list", superlink.CONNECTION)
 
 
 def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deployment_too(standing, tiny, faulty):
-    deploy.submit(standing, tiny, 540)
-    assert_faults_were_survived(max(superlink.run_folders(tiny)), tiny)
+    deployment.submit(standing, tiny, 540)
+    assert_faults_were_survived(max(run_folder.run_folders(tiny)), tiny)
 
 
 def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
@@ -134,7 +141,7 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
     happened = []
 
     def meddle():
-        metrics = [folder / "metrics.jsonl" for folder in superlink.run_folders(config)]
+        metrics = [folder / "metrics.jsonl" for folder in run_folder.run_folders(config)]
         kinds = {e["kind"] for file in metrics if file.exists() for e in run_folder.read_events(file)}
         if "train" in kinds and not happened:
             standing.kill_node(1)
@@ -143,8 +150,8 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
             happened.append("started again")
             standing.start_node(1)
 
-    deploy.submit(standing, config, 900, meddle)
-    root = max(superlink.run_folders(config))
+    deployment.submit(standing, config, 900, meddle)
+    root = max(run_folder.run_folders(config))
     assert happened == ["killed", "started again"] and run_folder.read_stamp(root)["status"] == "completed"
     rejected, trained, counted = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train", "replies"))
     assert set(zip(rejected.who, rejected.reason, strict=True)) == {("client_1", "silent")}
@@ -156,21 +163,21 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
 
 def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(standing, tiny, monkeypatch, capsys):
     """On the processes that stand already: what stops new ones is tested with the interrupt."""
-    monkeypatch.setattr(deploy, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    monkeypatch.setattr(deployment, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
     flags = [f"--{name}={value}" for name, value in given(replace(tiny, min_replies=3)).items()]
     assert main(["deploy", "--profile", "tiny", "--tls", "--auth", *flags]) == 2
     said = capsys.readouterr().err
     assert said.startswith("fedvla deploy: run ") and "finished:failed" in said and said.count("\n") == 1
-    (root,) = superlink.run_folders(tiny)
+    (root,) = run_folder.run_folders(tiny)
     assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")
 
 
 def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tiny, tmp_path, monkeypatch, capsys):
-    whole, begun = engine.run_inline(tiny, progress=False), tmp_path / "begun"
+    whole, begun = run_inline(tiny, progress=False), tmp_path / "begun"
     shutil.copytree(whole, begun)
     shutil.rmtree(begun / "checkpoints/round_2")
-    run_folder.write_json(begun / "stamp.json", {**run_folder.read_stamp(begun), "status": "interrupted"})
-    monkeypatch.setattr(deploy, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    write_json(begun / "stamp.json", {**run_folder.read_stamp(begun), "status": "interrupted"})
+    monkeypatch.setattr(deployment, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
     assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 0
     said = capsys.readouterr().out
     assert "round 2, client_1, train: loss" in said and "round 1, client_1" not in said and str(begun) in said
@@ -178,7 +185,7 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     assert apart(resumed, at_once) <= 1e-6
     trained, wanted = (run_folder.read_metrics(root, "train")[["round", "who"]] for root in (begun, whole))
     assert trained.values.tolist() == wanted.values.tolist()
-    monkeypatch.setattr(deploy, "deployment", None)  # nothing is started any more
+    monkeypatch.setattr(deployment, "deployment", None)  # nothing is started any more
     assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 2
     said = capsys.readouterr()
     assert "is a completed run" in said.err and said.err.count("\n") == 1 and not said.out
@@ -186,12 +193,12 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
 
 @pytest.mark.unit
 def test_a_run_is_told_from_another_one_that_began_later_in_the_same_place(tiny):
-    before = superlink.run_folders(tiny)
-    assert superlink.own_run(tiny, before) is None
+    before = run_folder.run_folders(tiny)
+    assert run_folder.own_run(tiny, before) is None
     another = replace(tiny, seed=7)
     with run_folder.start(tiny, engine="flower") as own, run_folder.start(another, engine="flower") as later:
-        assert own.root < later.root and superlink.own_run(tiny, before) == own.root
-    assert superlink.own_run(tiny, {own.root}) is None
+        assert own.root < later.root and run_folder.own_run(tiny, before) == own.root
+    assert run_folder.own_run(tiny, {own.root}) is None
 
 
 def given(config):
@@ -219,8 +226,8 @@ def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_end
     os.killpg(process.pid, signal.SIGINT)
     warned = process.communicate(timeout=60)[1]
     assert process.returncode == 130 and "interrupted: every process is stopped" in warned
-    assert superlink.is_free(int(port)) and not left_over(port)
-    (root,) = superlink.run_folders(config)
+    assert processes.is_free(int(port)) and not left_over(port)
+    (root,) = run_folder.run_folders(config)
     assert run_folder.read_stamp(root)["status"] == "interrupted"
     assert load_file(root / "global_model/round_1/model.safetensors")
     assert set(run_folder.read_metrics(root, "train").query("round == 1").who) == {"client_0", "client_1"}
@@ -245,10 +252,13 @@ def test_a_deployment_has_as_many_clients_as_asked_for_or_as_its_profile():
 
 @pytest.mark.unit
 def test_authentication_needs_encryption_and_data_a_folder_for_each_client(tmp_path):
-    with pytest.raises(ValueError, match="auth=True needs tls=True"), deploy.deployment(tmp_path, 1, tls=False):
+    with (
+        pytest.raises(ValueError, match="auth=True needs tls=True"),
+        deployment.running_deployment(tmp_path, 1, tls=False),
+    ):
         pass
     with pytest.raises(ValueError, match="1 data folders for num-clients=2"):
-        with deploy.deployment(tmp_path, 2, data=[tmp_path]):
+        with deployment.running_deployment(tmp_path, 2, data=[tmp_path]):
             pass
     assert not list(tmp_path.iterdir())
 
@@ -264,7 +274,7 @@ def written_commands(program: str) -> list[list[str]]:
 @pytest.mark.unit
 @pytest.mark.parametrize("program", ["flower-superlink", "flower-supernode"])
 def test_flowers_programs_know_the_flags_of_the_recipe(program):
-    command = [superlink.program(program), "--help"]
+    command = [processes.program(program), "--help"]
     help_text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     used = [{word for word in words if word.startswith("--")} for words in written_commands(program)]
     assert len(used) >= 2 and all(flags for flags in used)

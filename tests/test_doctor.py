@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fedvla_lib import doctor
-from fedvla_lib.cli import main
+from fedvla_lib.cli import doctor
+from fedvla_lib.cli.main import main
 
 pytestmark = pytest.mark.unit
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fedvla_lib.drift import MOST_COMPARED, geometry
-from fedvla_lib.params import layer_of
+from fedvla_lib.federation.drift import MOST_COMPARED, geometry
+from fedvla_lib.policy.parameters import layer_of
 
 pytestmark = pytest.mark.unit
 EXPERT = "model.vlm_with_expert.lm_expert.layers.{}.mlp.up_proj.weight"

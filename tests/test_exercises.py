@@ -8,7 +8,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from fedvla_lib import exercises
+from fedvla_book import exercises
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]

@@ -8,12 +8,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import arms, clients, data, experiment, results, run_folder
-from fedvla_lib.cli import main
-from fedvla_lib.clients import CLIENT_SEEDS
+from fedvla_lib import run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, task_names
-from fedvla_lib.evaluate import FIRST_SEED
-from fedvla_lib.record import MAX_ATTEMPTS, demonstration_seed
+from fedvla_lib.data import recordings, splits
+from fedvla_lib.data.batches import Batches, frame_rows
+from fedvla_lib.data.record import MAX_ATTEMPTS, demonstration_seed
+from fedvla_lib.evaluation import measure
+from fedvla_lib.evaluation.rollouts import FIRST_SEED
+from fedvla_lib.experiments import experiment, methods, results
+from fedvla_lib.experiments.plan import QUIET, Plan, read_plan
+from fedvla_lib.federation.client import CLIENT_SEEDS
 
 REFERENCE = Path(__file__).parents[1] / "book" / "reference"
 
@@ -56,13 +61,13 @@ def file(tmp_path):
 
 @pytest.mark.unit
 def test_cells_come_seed_by_seed_and_only_those_wanted(file):
-    plan = experiment.read_plan(file)
+    plan = read_plan(file)
     assert [cell.name for cell in plan.cells] == [
         "mixed_averaged_0", "mixed_pooled_0", "by_task_averaged_0", "mixed_averaged_1", "mixed_pooled_1",
     ]  # fmt: skip
     assert plan.rollout_seeds == [2_000_000, 2_000_001]
     assert all(cell.config.seed == cell.seed and cell.config.tasks == "lift" for cell in plan.cells)
-    assert len({arms.total_steps(cell.config) for cell in plan.cells}) == 1
+    assert len({methods.total_steps(cell.config) for cell in plan.cells}) == 1
 
 
 @pytest.mark.unit
@@ -86,7 +91,7 @@ def test_a_file_that_cannot_be_used_is_named_with_the_remedy(file, change, messa
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1
     with pytest.raises(ValueError, match=message):
-        experiment.read_plan(file)
+        read_plan(file)
     assert not (file.parent / "out").exists()
 
 
@@ -110,8 +115,8 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
               "personal = 'projections'"]  # fmt: skip
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
-    plan = experiment.read_plan(file)
-    experiment.run_plan(experiment.Plan(plan.cells[:2], plan.rollout_seeds), out)
+    plan = read_plan(file)
+    experiment.run_plan(Plan(plan.cells[:2], plan.rollout_seeds), out)
     before = {path.name: (path / "stamp.json").stat().st_mtime_ns for path in out.iterdir()}
     assert main(["experiment", str(file), "--out", str(out)]) == 0
     said = capsys.readouterr().out
@@ -148,7 +153,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
 @pytest.mark.unit
 @pytest.mark.parametrize("file", sorted({*REFERENCE.glob("*.toml")} - {REFERENCE / "notes.toml"}), ids=lambda f: f.stem)
 def test_attempts_start_where_no_demonstration_and_no_look_during_training_did(file):
-    plan = experiment.read_plan(file)
+    plan = read_plan(file)
     config = plan.cells[0].config
     episodes = range(config.episodes_per_task * len(task_names(config)))
     shown = {demonstration_seed(0, index, attempt) for index in episodes for attempt in range(MAX_ATTEMPTS)}
@@ -159,15 +164,15 @@ def test_attempts_start_where_no_demonstration_and_no_look_during_training_did(f
 @pytest.fixture
 def handed_out(monkeypatch):
     """The episodes behind each training batch that is drawn, whoever draws it."""
-    episodes, rows_at = [], data.Batches.rows_at
+    episodes, rows_at = [], Batches.rows_at
 
     def noting(batches, step):
         rows = rows_at(batches, step)
-        assert np.isin(rows, data.frame_rows(batches.store, batches.episode_ids)).all()
+        assert np.isin(rows, frame_rows(batches.store, batches.episode_ids)).all()
         episodes.append(sorted(batches.episode_ids))
         return rows
 
-    monkeypatch.setattr(data.Batches, "rows_at", noting)
+    monkeypatch.setattr(Batches, "rows_at", noting)
     return episodes
 
 
@@ -176,9 +181,9 @@ def handed_out(monkeypatch):
 def test_no_arm_trains_on_a_held_out_episode_and_all_make_the_same_new_attempts(partition, handed_out):
     """What training was handed, for each kind of arm; the recording is the one of tests/test_labs.py."""
     settings = {"tasks": "lift,push", "num_labs": 3, "episodes_per_task": 6, "num_clients": 2, "num_server_rounds": 1}
-    config = experiment.with_recording(from_profile("tiny", **experiment.QUIET, **settings, partition=partition))
-    store, seeds = clients.open_frames(config), [2_000_000, 2_000_001]
-    held_out, shares = clients.held_out_episodes(store, config), clients.shares(store, config)
+    config = experiment.with_recording(from_profile("tiny", **QUIET, **settings, partition=partition))
+    store, seeds = recordings.open_frames(config), [2_000_000, 2_000_001]
+    held_out, shares = splits.held_out_episodes(store, config), splits.shares(store, config)
     own = sorted(sorted(share.train_ids) for share in shares)
     whole = sorted(store.episodes.episode_id[~store.episodes.episode_id.isin(held_out)])
     shown = {demonstration_seed(0, i, attempt) for i in range(len(store.episodes)) for attempt in range(MAX_ATTEMPTS)}
@@ -216,12 +221,12 @@ def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tm
 def test_a_wrong_choice_of_statistics_changes_the_model_or_how_it_acts(choice, recording):
     settings = {"tasks": "lift,push", "data": str(recording), "partition": "task", "num_clients": 2}
     right, wrong = from_profile("tiny", **settings), from_profile("tiny", **settings, normalisation=choice)
-    trained, other = (arms.federated_policy(config) for config in (right, wrong))
+    trained, other = (methods.federated_policy(config) for config in (right, wrong))
     same = all((trained.shared_arrays()[name] == other.shared_arrays()[name]).all() for name in trained.shared_arrays())
     assert same == (choice == "held-out")  # the last leaves training as it is, and reads its result wrongly
-    store = clients.open_frames(right)
-    ids = clients.held_out_episodes(store, right)
-    assert clients.validate(trained, store, ids, right) != clients.validate(other, store, ids, right)
+    store = recordings.open_frames(right)
+    ids = splits.held_out_episodes(store, right)
+    assert measure.measure_held_out(trained, store, ids, right) != measure.measure_held_out(other, store, ids, right)
 
 
 @pytest.mark.unit

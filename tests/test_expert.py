@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fedvla_lib.expert import Expert, expert_success
-from fedvla_lib.rollout import run_episode
-from fedvla_lib.scene import GRASP_SITE
-from fedvla_lib.sim import HOME, So100Env
-from fedvla_lib.tasks import TASKS
+from fedvla_lib.robot.expert import Expert, expert_success
+from fedvla_lib.robot.rollout import run_episode
+from fedvla_lib.robot.scene import GRASP_SITE
+from fedvla_lib.robot.sim import HOME, So100Env
+from fedvla_lib.robot.tasks import TASKS
 
 pytestmark = pytest.mark.integration
 

@@ -14,12 +14,20 @@ from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from safetensors.numpy import load_file
 
-from fedvla_lib import arms, client_app, clients, data, engine, model, run_folder, train, wire
-from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile
-from fedvla_lib.evaluate import read_video
-from fedvla_lib.params import digest, layer_of, shapes_of, trainable_arrays
-from fedvla_lib.roster import TooFewReplies
-from fedvla_lib.spec import ACTION_KEY, STATE_KEY
+from fedvla_lib import run_folder
+from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile, to_run_config
+from fedvla_lib.data import lerobot_reader, normalisation, recordings, splits
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.engines import inline
+from fedvla_lib.evaluation import measure
+from fedvla_lib.evaluation.video import read_video
+from fedvla_lib.experiments import methods
+from fedvla_lib.federation import client_app, messages
+from fedvla_lib.federation.client import LOADERS, client_seed, open_client
+from fedvla_lib.federation.nodes import TooFewReplies
+from fedvla_lib.policy import model, training
+from fedvla_lib.policy.parameters import digest, layer_of, shapes_of, trainable_arrays
+from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY
 
 pytestmark = pytest.mark.integration
 NO_ROLLOUTS = {"eval_rollouts": 0, "client_rollouts": 0}
@@ -35,7 +43,7 @@ def tiny(recording, tmp_path_factory):
 @pytest.fixture(scope="module")
 def full_run(tiny):
     """A run with everything in it: three clients, two rounds, rollouts and videos after the last."""
-    return engine.run_inline(replace(tiny, tasks="lift,push"), progress=False)
+    return inline.run_inline(replace(tiny, tasks="lift,push"), progress=False)
 
 
 def global_weights(root: Path, round_number: int) -> dict[str, np.ndarray]:
@@ -49,27 +57,31 @@ def same(left, right) -> bool:
 @pytest.mark.parametrize("rank", [0, 4])
 def test_one_client_averaging_equals_local_training_bit_for_bit(tiny, rank, tmp_path):
     config = replace(tiny, num_clients=1, num_server_rounds=2, local_steps=3, lora_rank=rank, **NO_ROLLOUTS)
-    federated = global_weights(engine.run_inline(config, progress=False), 2)
+    federated = global_weights(inline.run_inline(config, progress=False), 2)
 
-    store = clients.open_frames(config)
-    train_ids, _ = data.split(store, config.val_fraction, config.seed)
-    bundle = model.load_policy(config, data.pool_stats([data.episode_stats(store, train_ids)]))
-    batches = data.Batches(
-        store, train_ids, config.chunk_size, config.batch_size, clients.client_seed(config.seed, 0), config.augment
+    store = recordings.open_frames(config)
+    train_ids, _ = splits.split(store, config.val_fraction, config.seed)
+    bundle = model.load_policy(config, normalisation.pool_stats([normalisation.episode_stats(store, train_ids)]))
+    batches = Batches(
+        store, train_ids, config.chunk_size, config.batch_size, client_seed(config.seed, 0), config.augment
     )
     for start_step in (0, 3):
-        train.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
+        training.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
     model.save_policy(bundle, tmp_path / "local")  # with adapters added in
     assert same(federated, load_file(tmp_path / "local" / "model.safetensors"))
 
 
 def test_of_one_client_a_full_batch_and_one_step_federated_and_centralized_are_alike(tiny):
-    whole = clients.open_client(replace(tiny, num_clients=1), 0).num_examples
+    whole = open_client(replace(tiny, num_clients=1), 0).num_examples
     single = {"num_clients": 1, "num_server_rounds": 1, "local_steps": 1, "warmup_steps": 0}
     config = replace(tiny, **single, batch_size=whole, **NO_ROLLOUTS)
     start, federated, centralized = (
         bundle.shared_arrays()
-        for bundle in (arms.base(config), arms.federated_policy(config), arms.centralized(config, progress=False))
+        for bundle in (
+            methods.base(config),
+            methods.federated_policy(config),
+            methods.centralized(config, progress=False),
+        )
     )
     assert any(np.abs(federated[name] - start[name]).max() > 1e-5 for name in start)
     for name in start:
@@ -79,15 +91,15 @@ def test_of_one_client_a_full_batch_and_one_step_federated_and_centralized_are_a
 def test_two_chapters_that_want_the_same_models_at_once_train_them_once(tiny):
     config = replace(tiny, seed=11, num_clients=1, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
     with ThreadPoolExecutor(2) as chapters:
-        first, second = chapters.map(arms.federated, [config, config])
-        alone = list(chapters.map(arms.local_only, [config, config], [0, 0]))
+        first, second = chapters.map(methods.federated, [config, config])
+        alone = list(chapters.map(methods.local_only, [config, config], [0, 0]))
     assert first == second and list(first.parent.glob("*/")) == [first]
     assert same(*(bundle.shared_arrays() for bundle in alone))
 
 
 def test_two_runs_with_one_seed_agree_bit_for_bit(tiny):
     config = replace(tiny, fraction_train=0.7, **NO_ROLLOUTS)
-    first, second = (engine.run_inline(config, progress=False) for _ in range(2))
+    first, second = (inline.run_inline(config, progress=False) for _ in range(2))
     assert first != second
     for round_number in range(3):
         assert same(global_weights(first, round_number), global_weights(second, round_number))
@@ -126,9 +138,9 @@ def test_videos_come_back_from_every_client_and_play(full_run):
 
 def test_a_reloaded_global_model_measures_the_same(full_run):
     config = run_folder.read_config(full_run)
-    store = clients.open_frames(config)
+    store = recordings.open_frames(config)
     bundle = model.load_policy(replace(config, base=str(full_run / "global_model/round_2")))
-    frames, again = clients.validate(bundle, store, clients.held_out_episodes(store, config), config)
+    frames, again = measure.measure_held_out(bundle, store, splits.held_out_episodes(store, config), config)
     logged = run_folder.read_metrics(full_run, "evaluate").query("who == 'global' and round == 2").iloc[0]
     assert frames == logged.num_examples
     assert again["loss"] == pytest.approx(logged.loss, rel=1e-6)
@@ -137,16 +149,16 @@ def test_a_reloaded_global_model_measures_the_same(full_run):
 
 def test_clients_weigh_by_their_training_frames_and_normalise_with_pooled_statistics(full_run):
     config = run_folder.read_config(full_run)
-    store = clients.open_frames(config)
-    shares = clients.shares(store, config)
-    frames = {f"client_{k}": clients.num_frames(store, share.train_ids) for k, share in enumerate(shares)}
+    store = recordings.open_frames(config)
+    shares = splits.shares(store, config)
+    frames = {f"client_{k}": splits.num_frames(store, share.train_ids) for k, share in enumerate(shares)}
     trained = run_folder.read_metrics(full_run, "train")
     assert all(frames[who] == weight for who, weight in zip(trained.who, trained.num_examples, strict=True))
     assert len(set(frames.values())) > 1
 
     folder = full_run / "global_model/round_2"
     saved = load_file(next(folder.glob("policy_preprocessor_step_*normalizer*.safetensors")))
-    pooled = data.episode_stats(store, [episode for share in shares for episode in share.train_ids])
+    pooled = normalisation.episode_stats(store, [episode for share in shares for episode in share.train_ids])
     for key in (STATE_KEY, ACTION_KEY):
         np.testing.assert_allclose(saved[f"{key}.mean"], pooled[key]["mean"], rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(saved[f"{key}.std"], pooled[key]["std"], rtol=1e-5, atol=1e-5)
@@ -154,14 +166,14 @@ def test_clients_weigh_by_their_training_frames_and_normalise_with_pooled_statis
 
 @pytest.mark.parametrize("scheme", ["modulo", "task", "dirichlet"])
 def test_nothing_held_out_is_trained_on_and_nobody_shares(tiny, scheme):
-    store = clients.open_frames(tiny)
-    shares = clients.shares(store, replace(tiny, partition=scheme))
+    store = recordings.open_frames(tiny)
+    shares = splits.shares(store, replace(tiny, partition=scheme))
     trained = [episode for share in shares for episode in share.train_ids]
     held_out = [episode for share in shares for episode in share.val_ids]
     assert sorted(trained + held_out) == sorted(store.episodes.episode_id)
-    assert sorted(held_out) == sorted(clients.held_out_episodes(store, tiny))
+    assert sorted(held_out) == sorted(splits.held_out_episodes(store, tiny))
     for share in shares:
-        assert set(clients.tasks_of(store, share.val_ids)) <= set(clients.tasks_of(store, share.train_ids))
+        assert set(splits.tasks_of(store, share.val_ids)) <= set(splits.tasks_of(store, share.train_ids))
 
 
 def damaging(damage_of, tools) -> ClientApp:
@@ -190,10 +202,10 @@ def change_arrays(change, *, honest: bool = True):
     """Return a damage that changes the arrays, and the announced hash with them if it is to be `honest`."""
 
     def damage(content: RecordDict) -> None:
-        arrays = change(wire.unpack_arrays(content[wire.ARRAYS]))
-        content[wire.ARRAYS] = wire.pack_arrays(arrays)
+        arrays = change(messages.unpack_arrays(content[messages.ARRAYS]))
+        content[messages.ARRAYS] = messages.pack_arrays(arrays)
         if honest:
-            content[wire.NOTE] = wire.note(sha256=digest(arrays))
+            content[messages.NOTE] = messages.make_note(sha256=digest(arrays))
 
     return damage
 
@@ -207,7 +219,7 @@ def change_first(change):
 
 
 def no_examples(content: RecordDict) -> None:
-    content[wire.METRICS] = MetricRecord({**content[wire.METRICS], wire.EXAMPLES: 0})
+    content[messages.METRICS] = MetricRecord({**content[messages.METRICS], messages.EXAMPLES: 0})
 
 
 PATIENCE_S = 6.0
@@ -234,9 +246,9 @@ DAMAGE = {
 
 def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on(tiny):
     config = replace(tiny, num_clients=8, num_server_rounds=1, local_steps=1, round_timeout_s=PATIENCE_S, **NO_ROLLOUTS)
-    tools = engine.remembering(clients.TOOLS)
+    tools = inline.cached(LOADERS)
     app = damaging(dict(enumerate(DAMAGE.values())), tools)
-    root = engine.run_inline(config, clients_app=app, progress=False)
+    root = inline.run_inline(config, clients_app=app, progress=False)
 
     rejected = run_folder.read_metrics(root, "rejected").query("round == 1")
     assert dict(zip(rejected.who, rejected.reason, strict=True)) == {f"client_{k}": r for k, r in enumerate(DAMAGE)}
@@ -245,8 +257,10 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
     assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 7, 1)
 
     store = tools.open_frames(config)
-    alone = clients.open_client(config, 7, tools)
-    pooled = data.pool_stats([data.episode_stats(store, share.train_ids) for share in clients.shares(store, config)])
+    alone = open_client(config, 7, tools)
+    pooled = normalisation.pool_stats(
+        [normalisation.episode_stats(store, share.train_ids) for share in splits.shares(store, config)]
+    )
     bundle = model.load_policy(config, pooled)
     alone.train(bundle, 1)
     only_good = trainable_arrays(bundle.policy)
@@ -255,9 +269,9 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
 
 def test_too_few_good_replies_stop_the_run_and_leave_what_there_is(tiny, tmp_path):
     config = replace(tiny, min_replies=2, out=str(tmp_path), **NO_ROLLOUTS)
-    app = damaging({0: crash, 2: DAMAGE["hash"]}, engine.remembering(clients.TOOLS))
+    app = damaging({0: crash, 2: DAMAGE["hash"]}, inline.cached(LOADERS))
     with pytest.raises(TooFewReplies, match="round 1: 1 of 3 training replies are good, min-replies=2 are required"):
-        engine.run_inline(config, clients_app=app, progress=False)
+        inline.run_inline(config, clients_app=app, progress=False)
     (root,) = tmp_path.iterdir()
     assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")
     assert global_weights(root, 0)
@@ -269,17 +283,17 @@ def test_too_few_good_replies_stop_the_run_and_leave_what_there_is(tiny, tmp_pat
 
 def test_a_client_that_cannot_introduce_itself_is_left_out(tiny):
     config = replace(tiny, num_server_rounds=1, local_steps=1, **NO_ROLLOUTS)
-    inner, outer = client_app.build(engine.remembering(clients.TOOLS)), ClientApp()
+    inner, outer = client_app.build(inline.cached(LOADERS)), ClientApp()
 
     @outer.query()
     def query(message, context):
         if context.node_config["partition-id"] == 1:
-            raise data.DataError("episode 3 has a truncated video")
+            raise lerobot_reader.DataError("episode 3 has a truncated video")
         return inner(message, context)
 
     outer.train()(lambda message, context: inner(message, context))
     outer.evaluate()(lambda message, context: inner(message, context))
-    root = engine.run_inline(config, clients_app=outer, progress=False)
+    root = inline.run_inline(config, clients_app=outer, progress=False)
     assert set(run_folder.read_metrics(root, "train").who) == {"client_0", "client_2"}
     rejected = run_folder.read_metrics(root, "rejected").iloc[0]
     assert (rejected.to, rejected.reason) == ("query", "error")
@@ -288,51 +302,51 @@ def test_a_client_that_cannot_introduce_itself_is_left_out(tiny):
 
 def test_a_client_refuses_global_arrays_that_were_altered_on_the_way(tiny):
     config = replace(tiny, **NO_ROLLOUTS)
-    client = clients.open_client(config, 0)
+    client = open_client(config, 0)
     arrays = trainable_arrays(model.load_policy(config, client.statistics()).policy)
     announced = digest(arrays)
     arrays[next(iter(arrays))] += 1
     instructions = {
-        wire.ROUND: 1,
-        wire.DIGEST: announced,
-        wire.STATS: wire.pack_stats(client.statistics()),
+        messages.ROUND: 1,
+        messages.DIGEST: announced,
+        messages.STATS: normalisation.pack_stats(client.statistics()),
     }
-    engine.claim_identity()
-    grid = engine.InlineGrid(client_app.build(), 1, engine.to_run_config(replace(config, num_clients=1)))
-    content = RecordDict({wire.ARRAYS: wire.pack_arrays(arrays), wire.CONFIG: ConfigRecord(instructions)})
-    (reply,) = grid.send_and_receive([Message(content, engine.FIRST_NODE_ID, "train")])
+    inline.claim_identity()
+    grid = inline.InlineGrid(client_app.build(), 1, to_run_config(replace(config, num_clients=1)))
+    content = RecordDict({messages.ARRAYS: messages.pack_arrays(arrays), messages.CONFIG: ConfigRecord(instructions)})
+    (reply,) = grid.send_and_receive([Message(content, inline.FIRST_NODE_ID, "train")])
     assert reply.has_error()
     assert "SHA-256" in reply.error.reason
 
 
 def test_an_exception_surfaces_when_asked_for(tiny):
     config = replace(tiny, num_server_rounds=1, **NO_ROLLOUTS)
-    app = damaging({1: crash}, engine.remembering(clients.TOOLS))
+    app = damaging({1: crash}, inline.cached(LOADERS))
     with pytest.raises(OSError, match="no space left"):
-        engine.run_inline(config, clients_app=app, progress=False, raise_errors=True)
+        inline.run_inline(config, clients_app=app, progress=False, raise_errors=True)
 
 
 @pytest.mark.unit
 def test_a_partition_that_does_not_exist_is_refused_with_the_remedy(tiny):
     with pytest.raises(ValueError, match="partition-id=3 is not one of num-clients=3 partitions"):
-        clients.open_client(tiny, 3)
+        open_client(tiny, 3)
 
 
 @pytest.mark.unit
 def test_rollouts_are_due_every_so_many_rounds_and_at_the_end():
     config = from_profile("tiny", num_server_rounds=5)
-    due = {n: [r for r in range(6) if clients.rolls_out(replace(config, eval_every=n), r)] for n in (0, 2)}
+    due = {n: [r for r in range(6) if measure.rolls_out(replace(config, eval_every=n), r)] for n in (0, 2)}
     assert due == {0: [5], 2: [0, 2, 4, 5]}
 
 
 @pytest.mark.unit
 def test_client_streams_differ():
-    seeds = {clients.client_seed(seed, k) for seed in range(5) for k in range(10)}
+    seeds = {client_seed(seed, k) for seed in range(5) for k in range(10)}
     assert len(seeds) == 50
 
 
 def last_weights(config):
-    return global_weights(engine.run_inline(config, progress=False, raise_errors=True), config.num_server_rounds)
+    return global_weights(inline.run_inline(config, progress=False, raise_errors=True), config.num_server_rounds)
 
 
 def test_every_strategy_trains_the_robot_policy_and_fedprox_without_weight_is_fedavg(tiny):
@@ -353,7 +367,7 @@ def test_the_proximal_term_changes_what_clients_learn(tiny):
 
 def test_a_kept_optimiser_goes_on_in_the_next_round(tiny):
     settings = [replace(tiny, keep_optimizer=keep, **NO_ROLLOUTS) for keep in (True, False)]
-    kept, reset = (engine.run_inline(config, progress=False) for config in settings)
+    kept, reset = (inline.run_inline(config, progress=False) for config in settings)
     assert same(global_weights(kept, 1), global_weights(reset, 1))  # nothing to keep yet
     assert not same(global_weights(kept, 2), global_weights(reset, 2))
 
@@ -362,7 +376,7 @@ def test_a_run_records_what_travelled_and_how_far_clients_moved(tiny):
     config = replace(tiny, num_clients=2, num_server_rounds=1, **NO_ROLLOUTS)
     sizes = {}
     for name in ("fedavg", "scaffold"):
-        root = engine.run_inline(replace(config, strategy=name), progress=False)
+        root = inline.run_inline(replace(config, strategy=name), progress=False)
         replies = run_folder.read_metrics(root, "replies").set_index("to")
         sizes[name] = replies.loc["train", ["sent_bytes", "received_bytes"]].astype(int)
         arrays = trainable_arrays(model.load_policy(replace(config, base=str(root / "global_model/round_1"))).policy)
@@ -376,7 +390,7 @@ def test_a_run_records_what_travelled_and_how_far_clients_moved(tiny):
 
 def test_global_models_are_kept_and_measured_as_often_as_asked(tiny):
     config = replace(tiny, num_clients=2, num_server_rounds=5, validate_every=3, **NO_ROLLOUTS)
-    root = engine.run_inline(config, progress=False)
+    root = inline.run_inline(config, progress=False)
     events = run_folder.read_metrics(root, "evaluate")
     assert events[events.who == "global"]["round"].tolist() == [0, 3, 5]
     assert {path.name for path in (root / "global_model").iterdir()} == {"round_0", "round_3", "round_5"}
@@ -386,7 +400,7 @@ def test_rounded_exchange_learns_the_same_for_fewer_bytes(tiny):
     config = replace(tiny, num_clients=2, local_steps=4, **NO_ROLLOUTS)
     losses, sizes = {}, {}
     for exchange in EXCHANGES:
-        root = engine.run_inline(replace(config, exchange=exchange), progress=False, raise_errors=True)
+        root = inline.run_inline(replace(config, exchange=exchange), progress=False, raise_errors=True)
         replies = run_folder.read_metrics(root, "replies").query("to == 'train'")
         sizes[exchange] = replies[["sent_bytes", "received_bytes"]].sum()
         events = run_folder.read_metrics(root, "evaluate").query("who == 'global'")
@@ -410,19 +424,19 @@ def test_personal_parts_stay_with_their_client(tiny):
         seen.append((message.metadata.message_type, context.node_config["partition-id"], message, reply, context))
         return reply
 
-    honest = client_app.build(engine.remembering(clients.TOOLS))
+    honest = client_app.build(inline.cached(LOADERS))
     app = ClientApp()
     for kind in (app.query, app.train, app.evaluate):
         kind()(watched)
-    root = engine.run_inline(config, clients_app=app, progress=False, raise_errors=True)
+    root = inline.run_inline(config, clients_app=app, progress=False, raise_errors=True)
     start, end = (global_weights(root, number) for number in (0, 2))
     moved = {name for name in start if not np.array_equal(start[name], end[name])}
     assert moved and {layer_of(name) for name in moved} == {f"expert layer {i}" for i in range(4)}
     trained = [one for one in seen if one[0] == "train"]
     for _, _, message, reply, _ in trained:
-        for arrays in (message.content[wire.ARRAYS], reply.content[wire.ARRAYS]):
+        for arrays in (message.content[messages.ARRAYS], reply.content[messages.ARRAYS]):
             assert "projections" not in {layer_of(name) for name in arrays}
-    own = [wire.unpack_arrays(context.state[client_app.OWN]) for _, _, _, _, context in trained[-2:]]
+    own = [messages.unpack_arrays(context.state[client_app.OWN]) for _, _, _, _, context in trained[-2:]]
     assert {layer_of(name) for name in own[0]} == {"projections"}
     assert all(not np.array_equal(own[0][name], own[1][name]) for name in own[0])
     assert all(not np.array_equal(own[0][name], start[name]) for name in own[0])

@@ -85,8 +85,8 @@ def test_the_flower_app_has_every_setting_with_its_default():
     assert app["config"] == to_run_config(Config())
     assert [type(value) for value in app["config"].values()] == [type(v) for v in to_run_config(Config()).values()]
     assert app["components"] == {
-        "serverapp": "fedvla_lib.server_app:app",
-        "clientapp": "fedvla_lib.client_app:app",
+        "serverapp": "fedvla_lib.federation.server_app:app",
+        "clientapp": "fedvla_lib.federation.client_app:app",
     }
 
 

@@ -13,15 +13,18 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from conftest import assert_faults_were_survived
 from flwr.app import RecordDict
 from flwr.cli.build import build_fab_from_disk
 from flwr.cli.config_utils import load_and_validate
 from safetensors.numpy import load_file
 
-from fedvla_lib import client_app, engine, run_folder, superlink
-from fedvla_lib.cli import main
+from conftest import assert_faults_were_survived
+from fedvla_lib import run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, from_run_config
+from fedvla_lib.engines import app_bundle, simulation
+from fedvla_lib.engines.inline import run_inline
+from fedvla_lib.federation import client_app
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
@@ -52,7 +55,7 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     """Two rounds with everything that a client keeps from one to the next: control variate, optimiser, remainder."""
     tiny = replace(tiny, num_server_rounds=2, strategy="scaffold", keep_optimizer=True, exchange="int8")
     before = PYPROJECT.read_bytes()
-    root = superlink.run_simulation(tiny, timeout_s=540)
+    root = simulation.run_simulation(tiny, timeout_s=540)
     stamp = run_folder.read_stamp(root)
     assert (stamp["status"], stamp["engine"]) == ("completed", "flower")
     assert run_folder.read_config(root) == tiny
@@ -64,7 +67,7 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     assert all((root / video).stat().st_size > 1000 for video in videos)
     assert PYPROJECT.read_bytes() == before
     inline, forgetful = (
-        engine.run_inline(replace(tiny, client_rollouts=0), clients_app=app, progress=False, raise_errors=True)
+        run_inline(replace(tiny, client_rollouts=0), clients_app=app, progress=False, raise_errors=True)
         for app in (None, client_app.build(mods=[forget]))
     )
     left, right, other = (
@@ -80,7 +83,7 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
 
 def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_the_simulation_too(tiny, faulty):
     config = replace(tiny, num_server_rounds=2, client_rollouts=0, fraction_evaluate=0.0)
-    assert_faults_were_survived(superlink.run_simulation(config, timeout_s=540), config)
+    assert_faults_were_survived(simulation.run_simulation(config, timeout_s=540), config)
 
 
 def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsys):
@@ -92,10 +95,10 @@ def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsy
 
 @pytest.mark.unit
 def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path):
-    app = superlink.stage_app(tmp_path / "stage")
-    assert (app / "fedvla_lib/server_app.py").is_file()
+    app = app_bundle.stage_app(tmp_path / "stage")
+    assert (app / "fedvla_lib/federation/server_app.py").is_file()
     assert not list(app.rglob("__pycache__"))
-    settings = superlink.write_settings(tmp_path, tiny).read_text()
+    settings = app_bundle.write_settings(tmp_path, tiny).read_text()
     assert from_run_config(tomllib.loads(settings)) == tiny
 
 
@@ -120,4 +123,4 @@ def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
 @pytest.mark.unit
 def test_a_strangers_project_file_beside_the_package_is_not_taken(tmp_path):
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "another"\n')
-    assert not superlink._is_checkout(tmp_path) and superlink._is_checkout(PYPROJECT.parent)
+    assert not app_bundle._is_checkout(tmp_path) and app_bundle._is_checkout(PYPROJECT.parent)

@@ -10,10 +10,10 @@ from flwr.supercore.object_store import ObjectStoreFactory
 from flwr.superlink.federation import NoOpFederationManager
 from flwr.superlink.grid import InMemoryGrid
 
-from fedvla_lib import server_app
 from fedvla_lib.config import from_profile, to_run_config
-from fedvla_lib.engine import RUN_ID, InlineGrid, claim_identity
-from fedvla_lib.grid import MESSAGES_AT_ONCE, FewAtOnce, for_simulation
+from fedvla_lib.engines.inline import RUN_ID, InlineGrid, claim_identity
+from fedvla_lib.federation import server_app
+from fedvla_lib.federation.throttled_grid import MESSAGES_AT_ONCE, ThrottledGrid, for_simulation
 
 pytestmark = pytest.mark.unit
 CLIENTS = 10
@@ -47,7 +47,7 @@ def questions(grid) -> list[Message]:
 @pytest.mark.parametrize("limit", [1, 3, CLIENTS, 100])
 def test_everyone_is_asked_once_and_never_more_than_the_limit_at_a_time(limit):
     grid = grid_of()
-    replies = FewAtOnce(grid, limit).send_and_receive(questions(grid))
+    replies = ThrottledGrid(grid, limit).send_and_receive(questions(grid))
     assert sorted(reply.metadata.src_node_id for reply in replies) == sorted(grid.get_node_ids())
     assert max(grid.given) <= limit
     assert sum(grid.given) == CLIENTS
@@ -55,7 +55,7 @@ def test_everyone_is_asked_once_and_never_more_than_the_limit_at_a_time(limit):
 
 def test_who_was_not_asked_in_time_has_not_replied():
     grid = grid_of(answer_s=0.1)
-    replies = FewAtOnce(grid, 1).send_and_receive(questions(grid), timeout=0.25)
+    replies = ThrottledGrid(grid, 1).send_and_receive(questions(grid), timeout=0.25)
     assert 1 <= len(replies) < CLIENTS
 
 
@@ -64,7 +64,7 @@ def in_memory(kind=InMemoryGrid) -> InMemoryGrid:
 
 
 def test_only_the_grid_of_the_simulation_is_limited():
-    assert isinstance(for_simulation(in_memory()), FewAtOnce)
+    assert isinstance(for_simulation(in_memory()), ThrottledGrid)
     assert for_simulation(inline := grid_of()) is inline
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from fedvla_lib import ground, model, pretrain, scenery
-from fedvla_lib.config import Recipe
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY
-from fedvla_lib.tasks import ALL_TASKS
-from fedvla_lib.train import local_train
+from fedvla_lib.policy import model
+from fedvla_lib.policy.training import local_train
+from fedvla_lib.pretraining import grounding, pretrain
+from fedvla_lib.pretraining.recipe import Recipe
+from fedvla_lib.pretraining.scenes import THINGS, draw_scenes
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY
+from fedvla_lib.robot.tasks import ALL_TASKS
 
 pytestmark = pytest.mark.integration
 SMALL = Recipe(scenes=24, image_size=64, batch_size=8, grounding_steps=2, checkpoint_every=0)
@@ -20,7 +22,7 @@ IDENTITY = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY,
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenery") / "scenes"
-    return scenery.draw_scenery(folder, SMALL.scenes, image_size=64, seed=3, jitter=1.0, progress=False)
+    return draw_scenes(folder, SMALL.scenes, image_size=64, seed=3, jitter=1.0, progress=False)
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def test_what_is_drawn_at_a_things_place_has_its_colour(scenes):
     for row in range(SMALL.scenes):
         for camera, name in enumerate(CAMERAS):
             for thing, strongest in channel.items():
-                share = scenes.shares[row, camera, scenery.THINGS.index(thing)]
+                share = scenes.shares[row, camera, THINGS.index(thing)]
                 if np.isfinite(share).all() and (share >= 0).all() and (share < 1).all():
                     across, down = (share * 64).astype(int)
                     seen += 1
@@ -48,55 +50,55 @@ def test_what_is_drawn_at_a_things_place_has_its_colour(scenes):
 def test_scenes_vary_and_are_drawn_once(scenes, tmp_path):
     there = np.isfinite(scenes.places_m[..., 0])
     assert set(there[:, :3].sum(axis=1)) == {1, 2} and set(there[:, 3:].sum(axis=1)) == {0, 1, 2}
-    again = scenery.draw_scenery(tmp_path / "again", SMALL.scenes, image_size=64, seed=3, jitter=1.0, progress=False)
+    again = draw_scenes(tmp_path / "again", SMALL.scenes, image_size=64, seed=3, jitter=1.0, progress=False)
     assert all(np.array_equal(again.images[camera], scenes.images[camera]) for camera in CAMERAS)
     np.testing.assert_array_equal(again.places_m, scenes.places_m)
-    kept = scenery.draw_scenery(tmp_path / "again", 2, image_size=64, seed=9, jitter=0.0, progress=False)
+    kept = draw_scenes(tmp_path / "again", 2, image_size=64, seed=9, jitter=0.0, progress=False)
     assert len(kept.places_m) == SMALL.scenes  # what is there is not drawn again
 
 
 def test_a_sentence_names_what_is_there_and_says_where_in_it():
     rng = np.random.default_rng(0)
     for _ in range(50):
-        there = rng.permutation(len(scenery.THINGS))[: rng.integers(1, 5)]
-        text, phrases = ground.sentence(there, rng)
-        assert 1 <= len(phrases) <= ground.MOST_NAMED
+        there = rng.permutation(len(THINGS))[: rng.integers(1, 5)]
+        text, phrases = grounding.sentence(there, rng)
+        assert 1 <= len(phrases) <= grounding.MOST_NAMED
         assert {thing for thing, _, _ in phrases} <= set(there)
-        assert all(text[start:end] == scenery.THINGS[thing] for thing, start, end in phrases)
+        assert all(text[start:end] == THINGS[thing] for thing, start, end in phrases)
 
 
 def test_no_sentence_is_one_of_a_task():
     verbs = {wording.split()[0] for task in ALL_TASKS.values() for wording in task.wordings}
-    assert not verbs & {opening.strip().split(" ")[0] for opening in ground.OPENINGS}
+    assert not verbs & {opening.strip().split(" ")[0] for opening in grounding.OPENINGS}
 
 
 def test_things_are_marked_in_their_cells():
     shares = np.full((1, 1, 2, 2), np.nan)
     shares[0, 0, 1] = (0.8, 0.3)  # right, upper half
-    np.testing.assert_array_equal(ground.in_cells(shares, 2)[0], [[0, 0], [0, 1], [0, 0], [0, 0]])
-    assert not ground.in_cells(shares + 0.25, 2).any()  # now outside the picture
+    np.testing.assert_array_equal(grounding.in_cells(shares, 2)[0], [[0, 0], [0, 1], [0, 0], [0, 0]])
+    assert not grounding.in_cells(shares + 0.25, 2).any()  # now outside the picture
 
 
 def test_the_tokens_of_a_phrase_spell_it(scenes, bundle):
-    questions = ground.Questions(scenes, bundle, 8, seed=1)
+    questions = grounding.Questions(scenes, bundle, 8, seed=1)
     batch = questions.at(0)
     tokens = bundle.preprocess({key: batch[key] for key in (STATE_KEY, "task")})["observation.language.tokens"]
     spell = bundle.policy.model.vlm_with_expert.processor.tokenizer.decode
     for row in range(8):
         for thing in set(batch["named"][batch["named"][:, 0] == row, 2].tolist()):
             mine = (batch["named"][:, 0] == row) & (batch["named"][:, 2] == thing)
-            assert spell(tokens[row, batch["named"][mine, 1]]).strip() == scenery.THINGS[thing]
+            assert spell(tokens[row, batch["named"][mine, 1]]).strip() == THINGS[thing]
     assert torch.equal(questions.at(4)["named"], questions.at(4)["named"])
 
 
 def test_training_lowers_the_error_and_moves_what_sees_only(scenes, bundle):
-    batch = ground.Questions(scenes, bundle, 8, seed=1).plain(np.arange(8))
+    batch = grounding.Questions(scenes, bundle, 8, seed=1).plain(np.arange(8))
     before = {name: p.detach().clone() for name, p in bundle.policy.named_parameters()}
-    with ground.probing(bundle, seed=0):
-        first = ground.grounding_loss(bundle, batch).item()
+    with grounding.probing(bundle, seed=0):
+        first = grounding.grounding_loss(bundle, batch).item()
         local_train(bundle, _Same(batch), replace(pretrain.settings(SMALL), warmup_steps=1), steps=30,
-                    progress=False, loss=ground.grounding_loss)  # fmt: skip
-        assert ground.grounding_loss(bundle, batch).item() < 0.7 * first
+                    progress=False, loss=grounding.grounding_loss)  # fmt: skip
+        assert grounding.grounding_loss(bundle, batch).item() < 0.7 * first
     after = dict(bundle.policy.named_parameters())
     assert after.keys() == before.keys()  # the probes are gone
     moved = {name for name in before if not torch.equal(before[name], after[name])}

@@ -9,10 +9,11 @@ import sys
 import time
 from pathlib import Path
 
-import check_site
 import nbformat
 import pytest
 from playwright.sync_api import Page, sync_playwright
+
+import check_site
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]

@@ -6,9 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import clients, data, evaluate, lab, model, partition
 from fedvla_lib.config import from_profile
-from fedvla_lib.store import open_store
+from fedvla_lib.data import normalisation, partition, recordings, splits
+from fedvla_lib.data.frame_store import open_store
+from fedvla_lib.evaluation import rollouts
+from fedvla_lib.federation.client import open_client
+from fedvla_lib.policy import model
+from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.robot import labs
 
 pytestmark = pytest.mark.integration
 CONFIG = from_profile("tiny", tasks="lift,push", num_labs=3, partition="lab", num_threads=1, episodes_per_task=6)
@@ -16,12 +21,12 @@ CONFIG = from_profile("tiny", tasks="lift,push", num_labs=3, partition="lab", nu
 
 @pytest.fixture(scope="module")
 def store():
-    return open_store(data.resolve(CONFIG), image_size=CONFIG.image_size, progress=False)
+    return open_store(recordings.resolve(CONFIG), image_size=CONFIG.image_size, progress=False)
 
 
 def test_labs_do_not_depend_on_how_many_there_are():
-    assert lab.labs(3, seed=4) == lab.labs(5, seed=4)[:3] and lab.labs(1, seed=4) == [lab.REFERENCE]
-    assert len(set(lab.labs(5, seed=4))) == 5 and lab.labs(2, seed=4)[1] != lab.labs(2, seed=5)[1]
+    assert labs.labs(3, seed=4) == labs.labs(5, seed=4)[:3] and labs.labs(1, seed=4) == [labs.REFERENCE]
+    assert len(set(labs.labs(5, seed=4))) == 5 and labs.labs(2, seed=4)[1] != labs.labs(2, seed=5)[1]
 
 
 def test_a_recording_says_in_which_laboratory_each_episode_was_made(store):
@@ -49,24 +54,28 @@ def test_clients_get_laboratories(store, num_clients):
 
 def test_whoever_trains_on_a_recording_later_means_the_same_laboratories(store):
     ids = store.episodes.episode_id
-    assert clients.labs_of(store, ids, replace(CONFIG, seed=5)) == clients.labs_of(store, ids, CONFIG)
+    assert splits.labs_of(store, ids, replace(CONFIG, seed=5)) == splits.labs_of(store, ids, CONFIG)
 
 
 def test_a_client_acts_in_its_own_laboratory(store, tmp_path):
-    there = lab.labs(3)
-    bundle = model.load_policy(from_profile("tiny", base="nano-random", num_threads=1), data.episode_stats(store, [0]))
+    there = labs.labs(3)
+    bundle = model.load_policy(
+        from_profile("tiny", base="nano-random", num_threads=1), normalisation.episode_stats(store, [0])
+    )
     for k in range(3):
-        client = clients.open_client(CONFIG, k)
-        assert clients.labs_of(store, client.share.train_ids, CONFIG) == [there[k]]
+        client = open_client(CONFIG, k)
+        assert splits.labs_of(store, client.share.train_ids, CONFIG) == [there[k]]
         (row,) = client.roll_out(bundle, tmp_path / str(k))
         assert row["lab"] == there[k].name
 
 
 def test_an_evaluation_visits_the_laboratories_in_turn(store):
-    bundle = model.load_policy(from_profile("tiny", base="nano-random", num_threads=1), data.episode_stats(store, [0]))
-    actor, there = model.PolicyActor(bundle), lab.labs(2)
-    rows = evaluate.evaluate(actor, ["lift"], [1, 2, 3], image_size=64, labs=there, progress=False)
+    bundle = model.load_policy(
+        from_profile("tiny", base="nano-random", num_threads=1), normalisation.episode_stats(store, [0])
+    )
+    actor, there = PolicyActor(bundle), labs.labs(2)
+    rows = rollouts.evaluate(actor, ["lift"], [1, 2, 3], image_size=64, labs=there, progress=False)
     assert [row["lab"] for row in rows] == [there[1].name, there[0].name, there[1].name]
-    again = evaluate.evaluate(actor, ["lift"], [2], image_size=64, labs=there, progress=False)
+    again = rollouts.evaluate(actor, ["lift"], [2], image_size=64, labs=there, progress=False)
     assert again[0]["lab"] == rows[1]["lab"]  # a seed means the same scene in whatever company it is run
     assert again[0]["action_smoothness"] == pytest.approx(rows[1]["action_smoothness"], rel=1e-4)

@@ -12,12 +12,13 @@ import pytest
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
-from fedvla_lib import config as configs
-from fedvla_lib import model
-from fedvla_lib.expert import Expert
-from fedvla_lib.lerobot_env import So100SimConfig
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
-from fedvla_lib.tasks import COLORS, TASKS
+from fedvla_lib.config import from_profile
+from fedvla_lib.policy import model
+from fedvla_lib.robot.expert import Expert
+from fedvla_lib.robot.layout import COLORS
+from fedvla_lib.robot.lerobot_env import So100SimConfig
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
+from fedvla_lib.robot.tasks import TASKS
 
 pytestmark = pytest.mark.integration
 SIZE = 32
@@ -87,13 +88,13 @@ def test_an_unknown_task_is_named_with_the_valid_ones():
 @pytest.mark.slow
 def test_lerobot_eval_runs_a_saved_policy(tmp_path):
     """The command of the documentation, on a nano SmolVLA with random weights."""
-    config = configs.from_profile("tiny", base="nano-random", num_threads=1)
+    config = from_profile("tiny", base="nano-random", num_threads=1)
     stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY, ACTION_KEY)}
     model.save_policy(model.load_policy(config, stats), tmp_path / "policy")
     command = [
         sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={tmp_path / 'policy'}",
         "--policy.device=cpu", "--env.type=so100_sim", "--env.task=lift", f"--env.image_size={config.image_size}",
-        "--env.discover_packages_path=fedvla_lib.lerobot_env", "--eval.n_episodes=1", "--eval.batch_size=1",
+        "--env.discover_packages_path=fedvla_lib.robot.lerobot_env", "--eval.n_episodes=1", "--eval.batch_size=1",
         f"--output_dir={tmp_path / 'out'}",
     ]  # fmt: skip
     settings = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}

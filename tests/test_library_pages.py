@@ -5,10 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import library
 import nbformat
 import networkx
 import pytest
+
+import library
 from test_fences import MODULES, ours
 
 ROOT = Path(__file__).parents[1]
@@ -49,18 +50,20 @@ def notebook(folder: Path, name: str, code: str) -> Path:
 
 @pytest.mark.unit
 def test_uses_are_found_by_name_and_through_the_module(tmp_path):
-    one = notebook(tmp_path, "01", "from fedvla_lib import model\nfrom fedvla_lib.params import average as mean")
+    one = notebook(
+        tmp_path, "01", "from fedvla_lib import model\nfrom fedvla_lib.policy.parameters import average as mean"
+    )
     two = notebook(tmp_path, "02", "%time 1\nfrom fedvla_lib import model\nmodel.load_policy(3)\nother.load_policy()")
     used = library.used_in([one, two])
-    assert used["fedvla_lib.params.average"] == ["01"] and used["fedvla_lib.model"] == ["01", "02"]
-    assert used["fedvla_lib.model.load_policy"] == ["02"] and len(used) == 3
+    assert used["fedvla_lib.policy.parameters.average"] == ["01"] and used["fedvla_lib.policy.model"] == ["01", "02"]
+    assert used["fedvla_lib.policy.model.load_policy"] == ["02"] and len(used) == 3
 
 
 @pytest.mark.integration
 def test_a_described_function_links_to_its_chapter_and_equations_have_numbers(tmp_path):
     """With the settings of the book, strictly; a small module, so that nothing heavy is imported."""
     (tmp_path / "notebooks").mkdir()
-    notebook(tmp_path / "notebooks", "one", "from fedvla_lib.player import video_figure")
+    notebook(tmp_path / "notebooks", "one", "from fedvla_book.video_player import video_figure")
     tree = {"player": library.modules(ROOT)["player"]}
     (tmp_path / "index.md").write_text(f"# Functions\n\n$$ a = 1 $$\n\n$$\nb = 2\n$$\n\n{library.reference(tree)}")
     (tmp_path / "notebooks" / "one.md").write_text("---\norphan: true\n---\n# The chapter\n")
@@ -69,7 +72,10 @@ def test_a_described_function_links_to_its_chapter_and_equations_have_numbers(tm
         "myst_enable_extensions = ['dollarmath']\nnumfig = True\n"
         "exclude_patterns = ['*/*.ipynb']\nnitpick_ignore_regex = [['py:.*', '.*']]\n"
     )
-    environment = {"PYTHONPATH": f"{ROOT / 'book'}:{ROOT}", "PATH": str(Path(sys.executable).parent)}
+    environment = {
+        "PYTHONPATH": f"{ROOT / 'book/tools'}:{ROOT}:{ROOT / 'book'}",
+        "PATH": str(Path(sys.executable).parent),
+    }
     command = [sys.executable, "-m", "sphinx", "-q", "-n", "-W", str(tmp_path), str(tmp_path / "html")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -77,7 +83,7 @@ def test_a_described_function_links_to_its_chapter_and_equations_have_numbers(tm
     assert re.findall(r'class="eqno">\(([^<]*)\)<a class="headerlink" href="(#[^"]*)"', page) == [
         ("1", "#equation-1"), ("2", "#equation-2")
     ]  # fmt: skip
-    described = page[page.index('id="fedvla_lib.player.video_figure"') :]
+    described = page[page.index('id="fedvla_book.video_player.video_figure"') :]
     assert re.search(r'In the book: <a class="reference internal" href="notebooks/one.html"', described)
     assert "no frames that can be read" in described
 
@@ -87,7 +93,7 @@ def test_every_documented_module_has_a_section_and_a_row():
     trees = library.modules(ROOT)
     sections = set(re.findall(r"automodule:: fedvla_lib\.(\w+)", library.reference(trees)))
     assert {"model", "engine", "strategies", "player"} <= sections <= set(trees)
-    used = {"fedvla_lib.model.load_policy": ["03_local_training"]}
+    used = {"fedvla_lib.policy.model.load_policy": ["03_local_training"]}
     rows = library.table(ROOT, used).splitlines()[2:]
     assert len(rows) == len(trees)
     assert [row for row in rows if "03_local_training" in row] == [row for row in rows if row.startswith("| `model` |")]

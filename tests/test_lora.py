@@ -7,9 +7,12 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from fedvla_lib import clients, data, full_size, lora, model, train
 from fedvla_lib.config import from_profile
-from fedvla_lib.params import trainable_arrays
+from fedvla_lib.data import recordings, splits
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.evaluation import held_out
+from fedvla_lib.policy import actor, full_size, lora, model, training
+from fedvla_lib.policy.parameters import trainable_arrays
 
 pytestmark = pytest.mark.integration
 RANK = 4
@@ -19,14 +22,14 @@ RANK = 4
 def setup(recording):
     """Settings, held-out batch and training batches on the recording that all tests share."""
     config = from_profile("tiny", data=str(recording), lora_rank=RANK, num_threads=1)
-    store = clients.open_frames(config)
-    train_ids, val_ids = data.split(store, config.val_fraction, config.seed)
-    batch = clients.held_out_batches(store, val_ids, config)[0]
-    return config, batch, data.Batches(store, train_ids, config.chunk_size, config.batch_size, seed=0)
+    store = recordings.open_frames(config)
+    train_ids, val_ids = splits.split(store, config.val_fraction, config.seed)
+    batch = held_out.held_out_batches(store, val_ids, config)[0]
+    return config, batch, Batches(store, train_ids, config.chunk_size, config.batch_size, seed=0)
 
 
 def chunk(bundle, batch):
-    return model.predict_chunk(bundle, batch, torch.Generator().manual_seed(0))
+    return actor.predict_chunk(bundle, batch, torch.Generator().manual_seed(0))
 
 
 def test_at_first_adapters_change_nothing_and_they_alone_train(setup):
@@ -54,7 +57,7 @@ def test_training_moves_what_it_may_and_a_saved_policy_acts_the_same_without_ada
     config = replace(config, lora_freeze_a=freeze_a)
     bundle = model.load_policy(config)
     before = {name: p.detach().clone() for name, p in bundle.policy.named_parameters()}
-    train.local_train(bundle, batches, config, steps=3, progress=False)
+    training.local_train(bundle, batches, config, steps=3, progress=False)
     moved = {name for name, p in bundle.policy.named_parameters() if not torch.equal(p, before[name])}
     assert moved == set(trainable_arrays(bundle.policy))
     assert any(name.endswith(lora.A) for name in moved) != freeze_a
@@ -85,8 +88,8 @@ def test_averaging_a_and_b_apart_is_wrong_unless_a_is_shared():
 
 
 def test_the_full_model_has_the_published_number_of_trainable_parameters():
-    policy = full_size.skeleton()
+    policy = full_size.meta_policy()
     assert sum(p.numel() for p in policy.parameters()) == 450_046_176
-    assert sum(int(np.prod(shape)) for shape in full_size.travelling(policy).values()) == 99_880_992
+    assert sum(int(np.prod(shape)) for shape in full_size.exchanged_shapes(policy).values()) == 99_880_992
     lora.add_adapters(policy, 16, adapt_state=True)
-    assert sum(int(np.prod(shape)) for shape in full_size.travelling(policy).values()) == 742_656
+    assert sum(int(np.prod(shape)) for shape in full_size.exchanged_shapes(policy).values()) == 742_656

@@ -4,10 +4,11 @@ import re
 import zlib
 from pathlib import Path
 
+import pytest
+
 import build_book
 import check_site
 import make_pdf
-import pytest
 from test_build_book import project  # noqa: F401 - a fixture
 
 PAGE = """<!DOCTYPE html><html lang="en"><title>A page</title><h1>A page</h1>

@@ -4,11 +4,12 @@ import shutil
 from pathlib import Path
 from zipfile import ZipFile
 
-import check_zip
-import make_zip
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_notebook
+
+import check_zip
+import make_zip
 
 pytestmark = pytest.mark.integration
 ROOT = Path(__file__).parents[1]

@@ -11,11 +11,12 @@ import torch
 from lerobot.policies.smolvla import SmolVLAPolicy
 from safetensors.torch import load_file, save_file
 
-from fedvla_lib import config as configs
-from fedvla_lib import model
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY
+from fedvla_lib.config import from_profile
+from fedvla_lib.policy import model
+from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY
 
-CONFIG = configs.from_profile("tiny", base="nano-random", num_threads=1)
+CONFIG = from_profile("tiny", base="nano-random", num_threads=1)
 STATS = {key: {"mean": np.arange(6.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
 SCENE = SimpleNamespace(instruction="Lift the red cube.")
 
@@ -28,7 +29,7 @@ def observation(seed=0):
 
 
 def drive(bundle, steps=5, seed=0, episode=7, scene=SCENE):
-    actor = model.PolicyActor(bundle, seed)
+    actor = PolicyActor(bundle, seed)
     actor.reset(scene, episode)
     return np.stack([actor.act(observation(i)) for i in range(steps)])
 

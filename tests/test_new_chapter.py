@@ -6,8 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import new_chapter
 import pytest
+
+import new_chapter
 import test_exercises
 import test_notebooks
 from build_book import toc_pages
@@ -67,7 +68,7 @@ def test_it_runs_and_its_exercises_are_checked(copy):
         for _, name, _, _, solution in test_exercises.met(notebook)
     ]
     script = copy / "notebooks" / "answers.py"
-    script.write_text("import numpy as np\nfrom fedvla_lib.exercises import check\n\n" + "\n".join(answers))
+    script.write_text("import numpy as np\nfrom fedvla_book.exercises import check\n\n" + "\n".join(answers))
     environment = {**os.environ, "PYTHONPATH": str(copy), "FEDVLA_PROFILE": "tiny"}
     subprocess.run([sys.executable, str(script)], env=environment, check=True, cwd=copy / "notebooks")
     nbmake = [

@@ -3,10 +3,11 @@
 import re
 from pathlib import Path
 
-import build_book
 import nbformat
 import papermill
 import pytest
+
+import build_book
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parent.parent

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from fedvla_lib import params, wire
-from fedvla_lib.params import ParameterError
+from fedvla_lib.data import normalisation
+from fedvla_lib.federation import messages
+from fedvla_lib.policy import parameters
+from fedvla_lib.policy.parameters import ParameterError
 
 pytestmark = pytest.mark.unit
 
@@ -21,54 +23,54 @@ def policy():
 
 
 def test_only_trainable_parameters_travel_as_float32(policy):
-    arrays = params.trainable_arrays(policy)
+    arrays = parameters.trainable_arrays(policy)
     assert set(arrays) == {"gain", "1.weight", "1.bias", "2.weight", "2.bias"}
     assert {array.dtype for array in arrays.values()} == {np.dtype(np.float32)}
 
 
 def test_extracted_arrays_do_not_alias_the_live_weights(policy):
-    arrays = params.trainable_arrays(policy)
-    before = params.digest(arrays)
+    arrays = parameters.trainable_arrays(policy)
+    before = parameters.digest(arrays)
     with torch.no_grad():
         policy[1].weight.add_(1)
-    assert params.digest(arrays) == before
+    assert parameters.digest(arrays) == before
 
 
 def test_loading_restores_every_value_and_leaves_frozen_ones(policy):
     frozen = policy[0].weight.clone()
-    arrays = params.trainable_arrays(policy)
+    arrays = parameters.trainable_arrays(policy)
     other = {name: array + np.float32(1) for name, array in arrays.items()}
-    params.load_arrays(policy, other)
-    assert params.digest(params.trainable_arrays(policy)) != params.digest(arrays)
-    params.load_arrays(policy, arrays)
-    assert params.digest(params.trainable_arrays(policy)) == params.digest(arrays)
+    parameters.load_arrays(policy, other)
+    assert parameters.digest(parameters.trainable_arrays(policy)) != parameters.digest(arrays)
+    parameters.load_arrays(policy, arrays)
+    assert parameters.digest(parameters.trainable_arrays(policy)) == parameters.digest(arrays)
     assert torch.equal(policy[0].weight, frozen)
 
 
 def test_a_rejected_set_changes_nothing(policy):
-    before = params.digest(params.trainable_arrays(policy))
-    bad = params.trainable_arrays(policy)
+    before = parameters.digest(parameters.trainable_arrays(policy))
+    bad = parameters.trainable_arrays(policy)
     bad["gain"] = np.array(np.nan, np.float32)
     with pytest.raises(ParameterError):
-        params.load_arrays(policy, bad)
-    assert params.digest(params.trainable_arrays(policy)) == before
+        parameters.load_arrays(policy, bad)
+    assert parameters.digest(parameters.trainable_arrays(policy)) == before
 
 
 def test_a_frozen_policy_is_refused(policy):
     with pytest.raises(ValueError, match="no trainable parameter"):
-        params.trainable_arrays(policy.requires_grad_(False))
+        parameters.trainable_arrays(policy.requires_grad_(False))
 
 
 def test_digest_sees_values_names_and_shapes_but_not_order():
     a = {"x": np.zeros((2, 3), np.float32), "y": np.ones(2, np.float32)}
-    assert params.digest(a) == params.digest({"y": a["y"], "x": a["x"]})
+    assert parameters.digest(a) == parameters.digest({"y": a["y"], "x": a["x"]})
     changed = [
         {**a, "y": np.array([1, 1.0000001], np.float32)},
         {"x": a["y"], "y": a["x"]},
         {**a, "x": np.zeros((3, 2), np.float32)},
         {"x": a["x"]},
     ]
-    assert len({params.digest(c) for c in [a, *changed]}) == 5
+    assert len({parameters.digest(c) for c in [a, *changed]}) == 5
 
 
 def _damage(arrays):
@@ -88,22 +90,22 @@ def _damage(arrays):
 
 @pytest.mark.parametrize("fault", ["missing", "renamed", "reshaped", "float64", "infinite", "altered"])
 def test_each_kind_of_damage_is_named(policy, fault):
-    arrays = params.trainable_arrays(policy)
+    arrays = parameters.trainable_arrays(policy)
     kind, damaged = _damage(arrays)[fault]
     with pytest.raises(ParameterError) as caught:
-        params.check_arrays(damaged, params.shapes_of(arrays), params.digest(arrays))
+        parameters.check_arrays(damaged, parameters.shapes_of(arrays), parameters.digest(arrays))
     assert caught.value.kind == kind
     assert "\n" not in str(caught.value)
-    params.check_arrays(arrays, params.shapes_of(arrays), params.digest(arrays))
+    parameters.check_arrays(arrays, parameters.shapes_of(arrays), parameters.digest(arrays))
 
 
 def test_arrays_and_statistics_survive_the_wire_exactly(policy):
-    arrays = params.trainable_arrays(policy)
-    back = wire.unpack_arrays(wire.pack_arrays(arrays))
+    arrays = parameters.trainable_arrays(policy)
+    back = messages.unpack_arrays(messages.pack_arrays(arrays))
     assert list(back) == list(arrays)
-    assert params.digest(back) == params.digest(arrays)
+    assert parameters.digest(back) == parameters.digest(arrays)
     rng = np.random.default_rng(0)
     stats = {"action": {"mean": rng.normal(size=6), "count": np.array([7])}}
-    returned = wire.unpack_stats(wire.pack_stats(stats))
+    returned = normalisation.unpack_stats(normalisation.pack_stats(stats))
     assert np.array_equal(returned["action"]["mean"], stats["action"]["mean"])
     assert returned["action"]["count"].dtype.kind == "i"

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from fedvla_lib.config import PARTITIONS
-from fedvla_lib.partition import check_partition, heterogeneity, partition
+from fedvla_lib.data.partition import check_partition, heterogeneity, partition
 
 pytestmark = pytest.mark.unit
 TASKS = ("lift", "place", "push")

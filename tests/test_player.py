@@ -8,8 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from fedvla_lib import player
-from fedvla_lib.evaluate import encode_video
+from fedvla_book import video_player
+from fedvla_lib.evaluation.video import encode_video
 
 pytestmark = pytest.mark.unit
 SENTENCE = 'The arm lifts "the <red> cube" & stops.'
@@ -47,7 +47,7 @@ def content(uri, kind):
 def test_the_figure_holds_film_poster_and_sentence(film, tmp_path):
     path = tmp_path / "film.mp4"
     path.write_bytes(film)
-    page = Tags(player.video_figure(path, SENTENCE))
+    page = Tags(video_player.video_figure(path, SENTENCE))
     video = page.found["video"]
     assert not page.opened and page.words == video["aria-label"] == SENTENCE
     assert {"muted", "loop", "controls", "playsinline", "preload"} <= set(video)
@@ -57,7 +57,7 @@ def test_the_figure_holds_film_poster_and_sentence(film, tmp_path):
 
 
 def test_captions_say_the_sentence_over_the_whole_film(film):
-    track = Tags(player.video_figure(film, SENTENCE)).found["track"]
+    track = Tags(video_player.video_figure(film, SENTENCE)).found["track"]
     assert track["kind"] == "captions"
     head, time, text = content(track["src"], "text/vtt").decode().strip().replace("\n\n", "\n").split("\n")
     assert (head, time) == ("WEBVTT", "00:00.000 --> 00:02.500")
@@ -65,7 +65,7 @@ def test_captions_say_the_sentence_over_the_whole_film(film):
 
 
 def test_too_large_a_film_and_one_without_frames_are_refused(film):
-    for wrong, words in ((film.ljust(player.MAX_BYTES, b"0"), "less than 1 MB"), (b"no film", "no frames")):
+    for wrong, words in ((film.ljust(video_player.MAX_BYTES, b"0"), "less than 1 MB"), (b"no film", "no frames")):
         with pytest.raises(ValueError, match=words) as refused:
-            player.video_figure(wrong, SENTENCE)
+            video_player.video_figure(wrong, SENTENCE)
         assert "\n" not in str(refused.value)

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import plots
+from fedvla_book import plots
+from fedvla_lib.robot import spec
 
 matplotlib.use("Agg")
 pytestmark = pytest.mark.unit
@@ -39,7 +40,7 @@ def test_joints_draws_state_and_action_of_every_joint_in_seconds():
 
 def test_film_strip_shows_first_and_last_frame():
     frames = np.random.default_rng(0).integers(0, 255, (30, 8, 10, 3), np.uint8)
-    ax = plots.film_strip(frames, count=4)
+    ax = plots.frame_strip(frames, count=4)
     strip = ax.images[0].get_array()
     np.testing.assert_array_equal(strip[:, :10], frames[0])
     np.testing.assert_array_equal(strip[:, -10:], frames[-1])
@@ -80,14 +81,14 @@ def test_curves_are_labelled_and_show_what_they_are_given():
 
 def test_film_strips_show_every_camera():
     frames = np.random.default_rng(0).integers(0, 255, (12, 8, 8, 3), np.uint8)
-    axes = plots.film_strips({"overhead": frames, "front": frames[::-1]}, count=3)
+    axes = plots.frame_strips({"overhead": frames, "front": frames[::-1]}, count=3)
     assert [ax.get_title() for ax in axes] == ["camera: overhead", "camera: front"]
     np.testing.assert_array_equal(axes[1].images[0].get_array()[:, :8], frames[-1])
 
 
 def test_pictures_put_each_frame_in_its_place():
     frames = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), np.uint8)
-    axes = plots.pictures({"as it is": frames, "reversed": frames[::-1]}, titles=["a", "b", "c"])
+    axes = plots.image_table({"as it is": frames, "reversed": frames[::-1]}, titles=["a", "b", "c"])
     assert axes.shape == (2, 3) and axes[0, 2].get_title() == "c" and axes[1, 0].get_ylabel() == "reversed"
     np.testing.assert_array_equal(axes[1, 0].images[0].get_array(), frames[2])
 
@@ -132,7 +133,7 @@ def test_grouped_bars_give_every_number_a_bar_and_an_arm_its_colour():
     table = pd.DataFrame({"federated": [1.0, 2.0], "other": [3.0, 4.0]}, index=["lift", "push"])
     ax = plots.grouped_bars(table, xlabel="task", ylabel="loss")
     assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 4] and labelled(ax)
-    assert matplotlib.colors.to_hex(ax.patches[0].get_facecolor()) == plots.ARM_COLORS["federated"].lower()
+    assert matplotlib.colors.to_hex(ax.patches[0].get_facecolor()) == plots.METHOD_COLORS["federated"].lower()
 
 
 def test_clients_by_round_weights_the_mean_by_frames():
@@ -195,8 +196,8 @@ def test_flow_draws_a_line_per_time_and_the_goal():
 
 def test_the_film_of_a_flow_shows_each_time_and_holds_the_last():
     points = np.arange(12.0).reshape(3, 4)
-    film = plots.flow_film(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4), hold=2)
-    assert film.dtype == np.uint8 and len(film) == 6 + plots.FPS and not any(side % 2 for side in film.shape[1:3])
+    film = plots.flow_video(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4), hold=2)
+    assert film.dtype == np.uint8 and len(film) == 6 + spec.FPS and not any(side % 2 for side in film.shape[1:3])
     assert (film[0] == film[1]).all() and (film[4] == film[-1]).all()
     assert (film[1] != film[2]).any() and (film[3] != film[4]).any()
 
@@ -222,7 +223,7 @@ def test_padding_rate_and_errors_are_labelled_and_drawn_as_given():
     ax = plots.learning_rate([0.1, 0.2])
     np.testing.assert_allclose(ax.lines[0].get_ydata(), [0.1, 0.2])
     assert labelled(ax)
-    errors = pd.DataFrame({"a": range(6), "b": range(6)}, index=plots.JOINT_NAMES)
+    errors = pd.DataFrame({"a": range(6), "b": range(6)}, index=spec.JOINT_NAMES)
     ax = plots.error_by_joint(errors)
     assert [bar.get_height() for bar in ax.patches] == [*range(6), *range(6)]
     assert labelled(ax) and "[deg]" in ax.get_xticklabels()[0].get_text()
@@ -388,14 +389,14 @@ def test_client_drift_draws_every_local_phase_and_the_averages():
 
 
 def test_arms_and_clients_have_one_colour_each():
-    assert len({plots.arm_color(arm) for arm in plots.ARM_COLORS}) == len(plots.ARM_COLORS)
+    assert len({plots.method_color(arm) for arm in plots.METHOD_COLORS}) == len(plots.METHOD_COLORS)
     for figure in (plots.curves, plots.grouped_bars):  # wherever an arm stands among others
         table = pd.DataFrame({"other": [1.0, 2.0], "centralized": [1.0, 2.0]})
         ax = figure(table, xlabel="x", ylabel="y")
         found = ax.lines[1].get_color() if ax.lines else matplotlib.colors.to_hex(ax.patches[2].get_facecolor())
-        assert found.lower() == plots.ARM_COLORS["centralized"].lower()
-    assert plots.arm_color("FedAvg") == plots.arm_color("fedavg-200x2x2") == plots.arm_color("federated")
-    assert plots.arm_color("fedavg-10x4x20") != plots.arm_color("federated")
+        assert found.lower() == plots.METHOD_COLORS["centralized"].lower()
+    assert plots.method_color("FedAvg") == plots.method_color("fedavg-200x2x2") == plots.method_color("federated")
+    assert plots.method_color("fedavg-10x4x20") != plots.method_color("federated")
     assert len(set(plots.CLIENT_COLORS)) == 10 and plots.client_color(13) == plots.client_color(3)
 
 
@@ -434,7 +435,7 @@ def sources():
 
 @pytest.mark.parametrize("code", list(sources()))
 def test_no_figure_has_a_colour_of_its_own(code):
-    known = {*plots.PALETTE, *plots.CLIENT_COLORS, *plots.ARM_FAMILIES.values()}
+    known = {*plots.PALETTE, *plots.CLIENT_COLORS, *plots.METHOD_FAMILIES.values()}
     assert not [colour for colour in colours_in(ast.parse(code)) if colour not in known and not is_neutral(colour)]
 
 

@@ -6,21 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from fedvla_lib import config as configs
-from fedvla_lib import data, model, prefix, train
-from fedvla_lib.params import trainable
-from fedvla_lib.spec import CAMERAS, STATE_KEY, image_key
+from fedvla_lib.config import from_profile
+from fedvla_lib.data import normalisation
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.policy import model, prefix_cache, training
+from fedvla_lib.policy.parameters import trainable
+from fedvla_lib.robot.spec import CAMERAS, STATE_KEY, image_key
 
-CONFIG = configs.from_profile("tiny", base="nano-random", num_threads=1)
+CONFIG = from_profile("tiny", base="nano-random", num_threads=1)
 
 
 def fresh(store, config=CONFIG):
-    return model.load_policy(config, data.episode_stats(store, store.episodes.episode_id))
+    return model.load_policy(config, normalisation.episode_stats(store, store.episodes.episode_id))
 
 
 def batches_of(store, augment=False):
     ids = list(store.episodes.episode_id)
-    return data.Batches(store, ids, CONFIG.chunk_size, CONFIG.batch_size, seed=1, augment=augment)
+    return Batches(store, ids, CONFIG.chunk_size, CONFIG.batch_size, seed=1, augment=augment)
 
 
 @pytest.mark.unit
@@ -28,7 +30,7 @@ def test_loss_and_gradients_equal_the_policys_own(store):
     bundle = fresh(store)
     bundle.policy.train()
     batches = batches_of(store)
-    stored = prefix.stored(bundle, batches)
+    stored = prefix_cache.with_cached_prefixes(bundle, batches)
     for step in range(3):
         batch = batches.at(step)
         noise = torch.randn(CONFIG.batch_size, CONFIG.chunk_size, 32)
@@ -36,7 +38,7 @@ def test_loss_and_gradients_equal_the_policys_own(store):
         expected, _ = bundle.policy.forward(bundle.preprocess(batch), noise=noise, time=times)
         trained = list(trainable(bundle.policy).values())
         wanted = torch.autograd.grad(expected, trained)
-        actual = prefix.prefix_loss(bundle, stored.at(step), noise, times)
+        actual = prefix_cache.prefix_loss(bundle, stored.at(step), noise, times)
         assert actual.item() == pytest.approx(expected.item(), rel=1e-6)
         for left, right in zip(wanted, torch.autograd.grad(actual, trained), strict=True):
             torch.testing.assert_close(left, right, rtol=1e-4, atol=1e-6)
@@ -45,9 +47,9 @@ def test_loss_and_gradients_equal_the_policys_own(store):
 @pytest.mark.unit
 def test_training_on_stored_prefixes_gives_the_same_losses_and_weights(store):
     results = []
-    for kind in (lambda _, b: b, prefix.stored):
+    for kind in (lambda _, b: b, prefix_cache.with_cached_prefixes):
         bundle = fresh(store)
-        result = train.local_train(bundle, kind(bundle, batches_of(store)), CONFIG, steps=4, progress=False)
+        result = training.local_train(bundle, kind(bundle, batches_of(store)), CONFIG, steps=4, progress=False)
         results.append((result.losses, {n: p.detach() for n, p in bundle.policy.named_parameters()}))
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-5)
     for name, weight in results[0][1].items():
@@ -62,26 +64,26 @@ def test_nothing_is_stored_where_the_prefix_changes(store):
         replace(CONFIG, freeze_vision_encoder=False, train_expert_only=False),
     ):
         batches = batches_of(store)
-        assert prefix.stored(fresh(store, config), batches) is batches
+        assert prefix_cache.with_cached_prefixes(fresh(store, config), batches) is batches
     augmented = batches_of(store, augment=True)
-    assert prefix.stored(fresh(store), augmented) is augmented
+    assert prefix_cache.with_cached_prefixes(fresh(store), augmented) is augmented
 
 
 @pytest.mark.unit
 def test_another_model_or_normalisation_gets_prefixes_of_its_own(store, tmp_path):
-    first = prefix.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
-    again = prefix.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
+    first = prefix_cache.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
+    again = prefix_cache.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
     np.testing.assert_array_equal(first.cache, again.cache)
     assert len(list(tmp_path.iterdir())) == 1
-    prefix.ensure_prefixes(fresh(store, replace(CONFIG, seed=1)), store, tmp_path, progress=False)
-    stats = data.episode_stats(store, store.episodes.episode_id)
+    prefix_cache.ensure_prefixes(fresh(store, replace(CONFIG, seed=1)), store, tmp_path, progress=False)
+    stats = normalisation.episode_stats(store, store.episodes.episode_id)
     stats[STATE_KEY]["mean"] = stats[STATE_KEY]["mean"] + 1
-    prefix.ensure_prefixes(model.load_policy(CONFIG, stats), store, tmp_path, progress=False)
+    prefix_cache.ensure_prefixes(model.load_policy(CONFIG, stats), store, tmp_path, progress=False)
     assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.unit
 def test_stored_batches_hold_no_images(store):
-    batch = prefix.stored(fresh(store), batches_of(store)).at(0)
+    batch = prefix_cache.with_cached_prefixes(fresh(store), batches_of(store)).at(0)
     assert not any(image_key(camera) in batch for camera in CAMERAS)
-    assert batch[prefix.PREFIX_KEY][1].shape[0] == CONFIG.batch_size
+    assert batch[prefix_cache.PREFIX_KEY][1].shape[0] == CONFIG.batch_size

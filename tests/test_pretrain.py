@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from fedvla_lib import model, pretrain
-from fedvla_lib.config import PROFILES, Config, Recipe, from_profile
-from fedvla_lib.sim import So100Env
-from fedvla_lib.tasks import PRETRAINING_TASKS, TASKS, draw_layout
+from fedvla_lib.config import PROFILES, Config, from_profile
+from fedvla_lib.policy import model, nano
+from fedvla_lib.pretraining import pretrain
+from fedvla_lib.pretraining.recipe import Recipe
+from fedvla_lib.robot.sim import So100Env
+from fedvla_lib.robot.tasks import PRETRAINING_TASKS, TASKS, draw_layout
 
 pytestmark = pytest.mark.integration
 SMALL = Recipe(
@@ -51,7 +53,7 @@ def test_the_same_recipe_gives_the_same_bits_after_an_interruption(made, tmp_pat
 
     shutil.rmtree(checkpoints / "step_000004")  # a training killed after step 2
     again = pretrain.pretrain(SMALL, tmp_path / "nano", progress=False)
-    one, other = (load_file(folder / model.WEIGHTS_FILE) for folder in (made, again))
+    one, other = (load_file(folder / nano.WEIGHTS_FILE) for folder in (made, again))
     assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
@@ -76,13 +78,13 @@ def test_a_base_can_be_moved_and_names_no_place_of_the_machine_that_made_it(made
 
 
 def test_the_base_in_the_package_is_small_whole_and_has_its_account():
-    size = sum(path.stat().st_size for path in model.nano_base().rglob("*") if path.is_file())
+    size = sum(path.stat().st_size for path in nano.nano_base().rglob("*") if path.is_file())
     assert size <= 10e6
     account = pretrain.read_account()
     assert account["recipe"] == json.loads(json.dumps(Recipe().__dict__))
     assert {row["task"] for row in account["success"]} == {*PRETRAINING_TASKS, *TASKS}
     for profile in ("tiny", "laptop"):
-        assert from_profile(profile).base == model.NANO
+        assert from_profile(profile).base == nano.NANO
         bundle = model.load_policy(from_profile(profile))  # with its own statistics
         assert sum(p.numel() for p in bundle.policy.parameters()) == account["parameters"]
     assert "base" in PROFILES["gpu"]
@@ -110,7 +112,7 @@ def test_pretraining_draws_every_wording():
 def test_a_bundle_without_weights_finds_the_installed_package(tmp_path, monkeypatch):
     """Flower's bundle takes .py files only, so the library in it lies beside no weights."""
     monkeypatch.setattr(model, "__file__", str(tmp_path / "fedvla_lib" / "model.py"))
-    assert (model.nano_base() / model.WEIGHTS_FILE).is_file()
+    assert (nano.nano_base() / nano.WEIGHTS_FILE).is_file()
     monkeypatch.setattr(model, "PACKAGE", "fedvla-lib-that-is-not-installed")
     with pytest.raises(ValueError, match="install it on every machine"):
-        model.nano_base()
+        nano.nano_base()

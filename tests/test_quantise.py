@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from flwr.app import Context, RecordDict
 
-from fedvla_lib import client_app, wire
 from fedvla_lib.config import EXCHANGES
-from fedvla_lib.params import ParameterError
-from fedvla_lib.quantise import DOWNWARD, SCALE, check_encoded, decode, encode, with_feedback
+from fedvla_lib.federation import client_app, messages
+from fedvla_lib.federation.quantisation import DOWNWARD, SCALE, check_encoded, decode, encode, with_feedback
+from fedvla_lib.policy.parameters import ParameterError
 
 pytestmark = pytest.mark.unit
 SHAPES = {"weight": (40, 30), "gain": ()}
@@ -72,7 +72,7 @@ def test_a_client_keeps_the_remainder_in_its_context_and_sends_it_later(exchange
         told += after["weight"] - start["weight"]
         sent = client_app._outgoing(after, start, exchange, context)
         arrived += decode(sent, exchange)["weight"]
-    left_over = wire.unpack_arrays(context.state[client_app.LEFT_OVER])["weight"]
+    left_over = messages.unpack_arrays(context.state[client_app.LEFT_OVER])["weight"]
     np.testing.assert_allclose(arrived + left_over, told, atol=1e-6)
     assert left_over.any()
 

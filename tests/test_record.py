@@ -13,15 +13,16 @@ import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import heed_interrupts
 from lerobot.datasets import LeRobotDataset
 
-from fedvla_lib import record as recording_module
-from fedvla_lib.record import demonstrate, record
-from fedvla_lib.rollout import Episode
-from fedvla_lib.sim import So100Env
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, STATE_KEY, image_key
-from fedvla_lib.tasks import task_of
+from conftest import heed_interrupts
+from fedvla_lib.data import episode_writer
+from fedvla_lib.data import record as record_module
+from fedvla_lib.data.record import _num_recorded, demonstrate, record
+from fedvla_lib.robot.rollout import Episode
+from fedvla_lib.robot.sim import So100Env
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, STATE_KEY, image_key
+from fedvla_lib.robot.tasks import task_of
 
 SIZE = 32
 NUM_PUTS = 7  # files that publishing one episode moves into place: two videos, rows, metadata, and three shared ones
@@ -48,8 +49,8 @@ def made_up_episode(index: int, length: int = 5) -> Episode:
 
 def write(root: Path, until: int) -> None:
     """Bring the made-up recording in `root` to `until` episodes."""
-    done = recording_module._num_recorded(root)
-    recorder = recording_module._Recorder(root, {"image_size": SIZE, "num_labs": 1}, done)
+    done = _num_recorded(root)
+    recorder = episode_writer.EpisodeWriter(root, {"image_size": SIZE, "num_labs": 1}, done)
     try:
         for index in range(done, until):
             recorder.add(made_up_episode(index), lab=0)
@@ -169,7 +170,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
 def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same_result(tmp_path, monkeypatch):
     """Publishing moves several files per episode; stop before each of them in turn, during the second episode."""
     write(tmp_path / "whole", 3)
-    move = recording_module._put
+    move = episode_writer._put
     for survived in range(NUM_PUTS):
         root, moved = tmp_path / f"died_after_{survived}", 0
 
@@ -182,7 +183,7 @@ def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same
             move(source, target)
 
         with monkeypatch.context() as patch:
-            patch.setattr(recording_module, "_put", dying)
+            patch.setattr(record_module, "_put", dying)
             with pytest.raises(KeyboardInterrupt):
                 write(root, 3)
         dataset = lerobot_opens(root)
@@ -198,7 +199,7 @@ def test_x264_is_kept_from_its_code_whose_bits_vary(tmp_path):
     av.logging.set_level(av.logging.INFO)
     try:
         with av.logging.Capture() as log, av.open(str(tmp_path / "film.mp4"), "w") as film:
-            stream = film.add_stream("h264", FPS, options=recording_module._encoder().get_codec_options(1, True))
+            stream = film.add_stream("h264", FPS, options=episode_writer._encoder().get_codec_options(1, True))
             stream.width, stream.height, stream.pix_fmt = SIZE, SIZE, "yuv444p"
             film.mux(stream.encode(av.VideoFrame(SIZE, SIZE, "yuv444p")))
             film.mux(stream.encode())
@@ -212,16 +213,18 @@ def test_x264_is_kept_from_its_code_whose_bits_vary(tmp_path):
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
 def test_a_killed_recording_holds_complete_episodes_and_continues_to_the_same_result(tmp_path, name):
     root, whole = tmp_path / "killed", tmp_path / "whole"
-    command = f"from fedvla_lib.record import record; record(['lift'], 50, {str(root)!r}, image_size={SIZE}, seed=3)"
+    command = (
+        f"from fedvla_lib.data.record import record; record(['lift'], 50, {str(root)!r}, image_size={SIZE}, seed=3)"
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", command], stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
     )
     deadline = time.monotonic() + 300
-    while recording_module._num_recorded(root) < 2 and process.poll() is None and time.monotonic() < deadline:
+    while _num_recorded(root) < 2 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     os.kill(process.pid, getattr(signal, name))
     _, message = process.communicate(timeout=60)
-    done = recording_module._num_recorded(root)
+    done = _num_recorded(root)
     dataset = lerobot_opens(root)
     assert 2 <= done == dataset.num_episodes < 50
     assert len(dataset) == sum(dataset.meta.episodes["length"])

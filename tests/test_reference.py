@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from fedvla_lib import arms, experiment, results, run_folder, search
+from fedvla_lib import run_folder
 from fedvla_lib.config import Config
+from fedvla_lib.experiments import methods, results, search
+from fedvla_lib.experiments.plan import read_plan
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
@@ -56,7 +58,7 @@ def test_each_stored_cell_is_complete_and_stamped():
 def test_each_stored_cell_is_one_that_its_file_asks_for():
     for file in sorted(REFERENCE.glob("*.toml")):
         if file.name != "notes.toml":
-            asked = {cell.name for cell in experiment.read_plan(file).cells}
+            asked = {cell.name for cell in read_plan(file).cells}
             stored = {cell.name for cell in CELLS if cell.parent.name == file.stem}
             assert stored <= asked, f"{file.name}: {sorted(stored - asked)}"
 
@@ -72,7 +74,7 @@ def test_each_stored_cell_was_run_with_the_settings_that_its_file_plans():
     for file in sorted(REFERENCE.glob("*.toml")):
         if file.name == "notes.toml":
             continue
-        plan = experiment.read_plan(file)
+        plan = read_plan(file)
         planned = {cell.name: cell for cell in plan.cells}
         for folder in (cell for cell in CELLS if cell.parent.name == file.stem):
             cell, stamp = planned[folder.name], run_folder.read_stamp(folder)
@@ -112,7 +114,7 @@ def test_stored_searches_are_complete_and_differ_in_the_strategy_alone():
 
 
 def test_results_of_other_code_carry_a_note():
-    notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], arms.trained_by()
+    notes, code = tomllib.loads((REFERENCE / "notes.toml").read_text())["code"], methods.trained_by()
     stamps = [run_folder.read_stamp(cell) for cell in CELLS]
     # The first search is older than the digest.
     stamps += [one["stamp"] for one in SEARCHES.values() if "code" in one["stamp"]]

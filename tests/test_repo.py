@@ -10,7 +10,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from fedvla_lib.cli import build_parser
+from fedvla_lib.cli.parser import build_parser
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parent.parent

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import results
+from fedvla_lib.experiments import results
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
@@ -76,7 +76,7 @@ def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
         ("uneven", "shared", "federated", "one"), ("uneven", "start", "base", "one"),
         ("lab", "pooled", "centralized", "five"), ("lab", "shared", "federated", "five"),
     )  # fmt: skip
-    found = results.lend(table)
+    found = results.repeat_partition_free(table)
     pd.testing.assert_frame_equal(found[: len(table)], table)
     lent = found[len(table) :]
     assert set(zip(lent.partition, lent.arm, strict=True)) == {
@@ -92,7 +92,7 @@ def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_sever
     assert several.any() and not set(stored[several].recording) & set(stored[~several].recording)
     assert stored[~several].recording.nunique() == 1
     lab = stored[several & (stored.kind != "base")]
-    found = results.lend(pd.concat([stored[~several], lab]))
+    found = results.repeat_partition_free(pd.concat([stored[~several], lab]))
     assert not ((found.partition == "lab") & (found.kind == "base")).any()
 
 

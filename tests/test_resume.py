@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from conftest import heed_interrupts, wait_for_interrupted
 from safetensors.numpy import load_file, save_file
 
-from fedvla_lib import checkpoint, engine, run_folder, server_app, superlink
-from fedvla_lib.checkpoint import Checkpoint
-from fedvla_lib.cli import main
+from conftest import heed_interrupts, wait_for_interrupted
+from fedvla_lib import files, run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, to_run_config
+from fedvla_lib.engines import inline, simulation
+from fedvla_lib.federation import checkpoint, server_app
+from fedvla_lib.federation.checkpoint import Checkpoint
 
 MAIN = "import sys; from fedvla_lib.cli import main; sys.exit(main())"
 KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
@@ -124,7 +126,7 @@ def assert_same_bits(left, right):
 )
 def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end, caplog):
     config = replace(tiny, **settings)
-    whole = engine.run_inline(config, progress=False)
+    whole = inline.run_inline(config, progress=False)
     root = start_and_end(replace(config, out=config.out + "_ended"), 3)
     assert main(["run", "--resume", str(root)]) == 0
     assert (f"{root}/checkpoints/round_" in caplog.text) == (start_and_end is start_kill_and_damage)
@@ -139,17 +141,17 @@ def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, setti
 @pytest.mark.slow
 def test_a_simulation_killed_whole_goes_on_and_ends_in_the_same_bits(tiny):
     """SuperLink, server and workers die together, as in a power cut; what they had written is enough."""
-    whole = engine.run_inline(tiny, progress=False)
+    whole = inline.run_inline(tiny, progress=False)
     config = replace(tiny, out=tiny.out + "_killed")
     root = start_and_kill(config, 2, "simulation")
-    assert superlink.run_simulation(replace(config, resume=str(root))) == root
+    assert simulation.run_simulation(replace(config, resume=str(root))) == root
     assert_same_bits(last_model(root), last_model(whole))
     assert run_folder.read_stamp(root)["status"] == "completed"
 
 
 @pytest.mark.integration
 def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
-    done = engine.run_inline(replace(tiny, num_server_rounds=1), progress=False)
+    done = inline.run_inline(replace(tiny, num_server_rounds=1), progress=False)
     refusals = {
         (str(done),): "completed run",
         (str(tmp_path / "nowhere"),): "no run folder there",
@@ -161,7 +163,7 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
         said = capsys.readouterr().err
         assert words in said and len(said.splitlines()) == 1
     stamp = run_folder.read_stamp(done)
-    run_folder.write_json(done / "stamp.json", stamp | {"status": "running"})
+    files.write_json(done / "stamp.json", stamp | {"status": "running"})
     for folder in (done / "checkpoints").glob("round_*"):
         (folder / "arrays.safetensors").write_bytes(b"half of it")
     assert main(["run", "--resume", str(done)]) == 2

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fedvla_lib.evaluate import evaluate
-from fedvla_lib.expert import Expert
-from fedvla_lib.rollout import run_episode
-from fedvla_lib.sim import HOME, So100Env
-from fedvla_lib.spec import CAMERAS, FPS
+from fedvla_lib.evaluation.rollouts import evaluate
+from fedvla_lib.robot.expert import Expert
+from fedvla_lib.robot.rollout import run_episode
+from fedvla_lib.robot.sim import HOME, So100Env
+from fedvla_lib.robot.spec import CAMERAS, FPS
 
 pytestmark = pytest.mark.integration
 SIZE = 32

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fedvla_lib import run_folder
+from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config, from_profile
 
 pytestmark = pytest.mark.unit
@@ -49,8 +49,8 @@ def test_settings_and_stamp_read_back(tmp_path):
 def test_the_hash_follows_what_is_computed_not_where():
     config = from_profile("tiny")
     moved, changed = from_profile("tiny", out="elsewhere", num_threads=3), from_profile("tiny", seed=1)
-    assert run_folder.config_hash(config) == run_folder.config_hash(moved)
-    assert run_folder.config_hash(config) != run_folder.config_hash(changed)
+    assert provenance.config_hash(config) == provenance.config_hash(moved)
+    assert provenance.config_hash(config) != provenance.config_hash(changed)
 
 
 def test_events_become_columns(tmp_path):
@@ -118,7 +118,7 @@ def test_a_run_is_going_on_as_long_as_its_process_lives(tmp_path):
 
 
 def test_a_stamp_of_a_run_before_there_were_locks_is_read_too(tmp_path):
-    run_folder.write_json(tmp_path / "stamp.json", {"status": "running"})
+    files.write_json(tmp_path / "stamp.json", {"status": "running"})
     assert run_folder.read_stamp(tmp_path)["status"] == "interrupted"
     assert not (tmp_path / run_folder.LOCK).exists()
 
@@ -171,6 +171,6 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
 
 
 def test_atomic_writes_leave_no_scratch_files(tmp_path):
-    run_folder.write_json(tmp_path / "a.json", {"x": [np.float64(1), float("inf")]})
+    files.write_json(tmp_path / "a.json", {"x": [np.float64(1), float("inf")]})
     assert json.loads((tmp_path / "a.json").read_text()) == {"x": [1.0, None]}
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

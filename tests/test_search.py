@@ -6,11 +6,14 @@ from dataclasses import asdict, replace
 import optuna
 import pytest
 
-from fedvla_lib import arms, clients, search
-from fedvla_lib.cli import main
-from fedvla_lib.compare import wilson
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import Config, from_profile
-from fedvla_lib.strategies import SERVER_LR
+from fedvla_lib.data import recordings, splits
+from fedvla_lib.evaluation import measure
+from fedvla_lib.evaluation.statistics import wilson
+from fedvla_lib.experiments import methods, search
+from fedvla_lib.federation import client
+from fedvla_lib.federation.strategies.build import SERVER_LR
 
 
 @pytest.mark.unit
@@ -22,7 +25,7 @@ def test_every_trial_has_the_same_budget(strategy):
     for _ in range(30):
         trial = study.ask()
         tried = search.suggest(trial, config)
-        assert arms.total_steps(tried) == arms.total_steps(config)
+        assert methods.total_steps(tried) == methods.total_steps(config)
         assert set(trial.params) == {"local_steps", "fraction_train", "lr"} | also
         assert all(getattr(tried, name) == value for name, value in trial.params.items())
         assert set(trial.params) <= set(search.SEARCHED)
@@ -31,13 +34,13 @@ def test_every_trial_has_the_same_budget(strategy):
 @pytest.fixture
 def judged(monkeypatch):
     """The episodes behind each loss that the search looks at, in order."""
-    episodes, validate = [], clients.validate
+    episodes, validate = [], measure.measure_held_out
 
     def noting(bundle, store, episode_ids, config):
         episodes.append(list(episode_ids))
         return validate(bundle, store, episode_ids, config)
 
-    monkeypatch.setattr(clients, "validate", noting)
+    monkeypatch.setattr(client, "validate", noting)
     return episodes
 
 
@@ -58,11 +61,11 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     assert found["selection_loss"] == min(losses)
     assert found["best"]["loss"] != found["selection_loss"]  # measured on other episodes
     assert found["start"]["n"] == found["best"]["n"] == 2
-    assert found["stamp"]["code"] == arms.trained_by()  # as in a run folder of an experiment
+    assert found["stamp"]["code"] == methods.trained_by()  # as in a run folder of an experiment
     assert found["first_rollout_seed"] == search.ROLLOUTS_FROM
     config = from_profile("tiny", tasks="lift,push", num_clients=2, data=str(recording), val_fraction=0.5)
-    store = clients.open_frames(config)
-    held_out, shares = clients.held_out_episodes(store, config), clients.shares(store, config)
+    store = recordings.open_frames(config)
+    held_out, shares = splits.held_out_episodes(store, config), splits.shares(store, config)
     trial, start, best = held_out[0::2], held_out[1::2], held_out[1::2]
     assert judged == [trial, start, best, trial, start, best]  # of the first call, and of the one that went on
     assert trial and not set(trial) & set(best)

@@ -12,21 +12,19 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from fedvla_lib.lab import REFERENCE, draw_lab
-from fedvla_lib.scene import decimated_meshes
-from fedvla_lib.sim import ENV_ID, HOME, So100Env, from_radians, to_radians
-from fedvla_lib.spec import CAMERAS, NUM_JOINTS
-from fedvla_lib.tasks import (
+from fedvla_lib.robot.labs import REFERENCE, draw_lab
+from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, CUBES_APART_M
+from fedvla_lib.robot.meshes import decimated_meshes
+from fedvla_lib.robot.sim import ENV_ID, HOME, So100Env, from_radians, to_radians
+from fedvla_lib.robot.spec import CAMERAS, NUM_JOINTS
+from fedvla_lib.robot.tasks import (
     ALL_TASKS,
     AWAY_M,
-    COLORS,
-    CUBE_HALF_M,
-    CUBES_APART_M,
     LIFT_CLEARANCE_M,
     PLACE_HALF_M,
     PUSH_RADIUS_M,
     TASKS,
-    Scene,
+    TaskState,
     check_tasks,
     draw_layout,
     task_of,
@@ -240,11 +238,11 @@ def test_observations_share_no_memory_with_the_simulation():
 # --- success means success
 
 
-def scene(**changes) -> Scene:
+def scene(**changes) -> TaskState:
     """A cube at rest on the zone's centre, nothing near it."""
     calm = dict(clearance_m=0.0, peak_clearance_m=0.0, speed_mps=0.0, zone_offset_m=(0.0, 0.0), held=False,
                 touched=False, carried=False, flung=False, hand_distance_m=0.1)  # fmt: skip
-    return Scene(**{**calm, **changes})
+    return TaskState(**{**calm, **changes})
 
 
 LIFTED = dict(clearance_m=LIFT_CLEARANCE_M + 0.01, held=True, touched=True)
@@ -525,7 +523,7 @@ def test_pictures_are_not_blank():
 
 @pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
 def test_a_fresh_process_draws_without_being_told_how_and_exits_quietly():
-    code = "from fedvla_lib.sim import So100Env; print(*So100Env(image_size=16).reset(seed=0)[0]['pixels'])"
+    code = "from fedvla_lib.robot.sim import So100Env; print(*So100Env(image_size=16).reset(seed=0)[0]['pixels'])"
     untold = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=untold)
     assert (done.returncode, done.stdout.split()) == (0, list(CAMERAS)), done.stderr
@@ -535,7 +533,7 @@ def test_a_fresh_process_draws_without_being_told_how_and_exits_quietly():
 @pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
 @pytest.mark.parametrize(("driver", "first"), [("off", "numpy"), ("", "mujoco")])
 def test_drawing_that_cannot_work_says_what_to_set(driver, first):
-    code = f"import {first}; from fedvla_lib.sim import So100Env; So100Env(image_size=16).reset(seed=0)"
+    code = f"import {first}; from fedvla_lib.robot.sim import So100Env; So100Env(image_size=16).reset(seed=0)"
     mute = {**os.environ, "MUJOCO_GL": driver}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=mute)
     message = done.stderr.strip().splitlines()[-1]
@@ -544,7 +542,7 @@ def test_drawing_that_cannot_work_says_what_to_set(driver, first):
 
 
 def test_settings_and_specification_do_not_load_the_simulator():
-    code = "import sys, fedvla_lib.config, fedvla_lib.spec, fedvla_lib.tasks; sys.exit('mujoco' in sys.modules)"
+    code = "import sys, fedvla_lib.config, fedvla_lib.robot.spec, fedvla_lib.robot.tasks; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
 
 

@@ -15,11 +15,13 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
-from conftest import heed_interrupts, wait_for_interrupted
 
-from fedvla_lib import client_app, run_folder, standing, superlink
-from fedvla_lib.cli import main
+from conftest import heed_interrupts, wait_for_interrupted
+from fedvla_lib import run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, to_run_config
+from fedvla_lib.engines import processes, superlink, superlink_service
+from fedvla_lib.federation import client_app
 
 ROOT = Path(__file__).parents[1]
 
@@ -44,7 +46,7 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
         assert main(["superlink", "last"]) == 2 and "has had no run yet" in capsys.readouterr().err
         run_app("local-simulation", tiny, "--federation-config", "num-supernodes=3 client-resources-num-cpus=1")
-        (root,) = superlink.run_folders(tiny)
+        (root,) = run_folder.run_folders(tiny)
         assert run_folder.read_stamp(root)["status"] == "completed"
         assert run_folder.read_config(root) == tiny
         assert len(run_folder.read_metrics(root, "train")) == 2  # half of three clients
@@ -53,7 +55,7 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
             run_app("local-simulation", replace(tiny, data="nowhere/at/all"))
         else:
             assert "ActorPool is empty" in run_app("local-simulation-gpu", tiny)
-            wait_for_interrupted(max(superlink.run_folders(tiny)))
+            wait_for_interrupted(max(run_folder.run_folders(tiny)))
         assert main(["superlink", "last"]) == 2 and "is finished:failed" in capsys.readouterr().out
     finally:
         assert main(["superlink", "down"]) == 0
@@ -69,7 +71,7 @@ def run_app(connection, config, *options):
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
     words = " ".join(f"{name}={json.dumps(value)}" for name, value in told.items())
-    command = [superlink.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words, *options]
+    command = [processes.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words, *options]
     environment = superlink.flower_environment(Path(os.environ["FLWR_HOME"]))
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -105,25 +107,25 @@ def processes_of(home):
 
 @pytest.mark.unit
 def test_connections_of_ones_own_stay_and_one_in_the_way_is_named(tmp_path):
-    file, ours = tmp_path / "config.toml", tomllib.loads(standing.CONNECTIONS.read_text())["superlink"]
+    file, ours = tmp_path / "config.toml", tomllib.loads(superlink_service.CONNECTIONS.read_text())["superlink"]
     own = '# mine\n[superlink]\ndefault = "labs"\n\n[superlink.labs]\naddress = "server.example.org:9493"\n'
     file.write_text(own)
-    standing.add_connections(file)
+    superlink_service.add_connections(file)
     assert file.read_text().startswith(own)
     merged = tomllib.loads(file.read_text())["superlink"]
     assert merged == {**ours, "default": "labs", "labs": {"address": "server.example.org:9493"}}
     once = file.read_text()
-    standing.add_connections(file)
+    superlink_service.add_connections(file)
     assert file.read_text() == once
     other = own.replace("labs]", "local-simulation]")
     for text, words in ((other, "has another \\[superlink.local-simulation\\]"), ("default = ", "is no TOML")):
         file.write_text(text)
         with pytest.raises(ValueError, match=words):
-            standing.add_connections(file)
+            superlink_service.add_connections(file)
         assert file.read_text() == text
     file.unlink()
-    standing.add_connections(file)
-    assert file.read_text() == standing.CONNECTIONS.read_text()
+    superlink_service.add_connections(file)
+    assert file.read_text() == superlink_service.CONNECTIONS.read_text()
 
 
 @pytest.mark.unit
@@ -138,7 +140,10 @@ def test_a_client_computes_on_the_card_that_is_reserved_for_it(device, cards, ch
 def test_what_a_reader_types_names_connections_and_settings_that_there_are():
     pages = [(ROOT / name).read_text() for name in ("README.md", "book/deployment.md")]
     told = [line for page in pages for line in re.findall(r"flwr run \. [^\n`]*", page)]
-    known = {*tomllib.loads(standing.CONNECTIONS.read_text())["superlink"], "labs"}  # the last is the page's own
+    known = {
+        *tomllib.loads(superlink_service.CONNECTIONS.read_text())["superlink"],
+        "labs",
+    }  # the last is the page's own
     assert "[superlink.labs]" in pages[1] and {line.split()[3] for line in told} == known - {"default"}
     overrides = re.findall(r"""--run-config (?:"([^"]+)"|'([^']+)')""", "\n".join(pages))
     given = [word.split("=") for pair in overrides for word in "".join(pair).split()]
@@ -151,7 +156,7 @@ def test_a_port_that_another_program_uses_is_named(tmp_path, monkeypatch, capsys
     monkeypatch.setenv("FLWR_HOME", str(tmp_path / "flwr"))
     with socket.socket() as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a SuperLink may have left it a moment ago
-        if superlink.is_free(9493):  # and no other program uses it indeed
+        if processes.is_free(9493):  # and no other program uses it indeed
             other.bind(("127.0.0.1", 9493))
             other.listen()
         assert main(["superlink", "up"]) == 2

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+
 import status
 
 pytestmark = pytest.mark.unit

@@ -16,9 +16,9 @@ import pytest
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
-from fedvla_lib.source import DataError, locate
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, JOINT_NAMES, STATE_KEY, image_key
-from fedvla_lib.store import fit_square, open_store
+from fedvla_lib.data.frame_store import fit_square, open_store
+from fedvla_lib.data.lerobot_reader import DataError, locate
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, JOINT_NAMES, STATE_KEY, image_key
 
 SIZE = 64  # of the recording in conftest
 OLD_NAMES = ["main_" + name.removesuffix(".pos") for name in JOINT_NAMES]

@@ -10,12 +10,25 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
-from fedvla_lib import data, strategies, wire
 from fedvla_lib.config import Config
-from fedvla_lib.engine import FIRST_NODE_ID, InlineGrid, claim_identity
-from fedvla_lib.params import ParameterError, digest, shapes_of
-from fedvla_lib.roster import Roster, TooFewReplies, call, wait_for_nodes
-from fedvla_lib.strategies import CheckedFedAvg
+from fedvla_lib.data import normalisation
+from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid, claim_identity
+from fedvla_lib.federation.messages import (
+    ARRAYS,
+    CONFIG,
+    EXAMPLES,
+    METRICS,
+    NOTE,
+    checked_arrays,
+    make_note,
+    pack_arrays,
+    unpack_arrays,
+    unpack_rollouts,
+)
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, call, wait_for_nodes
+from fedvla_lib.federation.strategies import build
+from fedvla_lib.federation.strategies.fedavg import CheckedFedAvg
+from fedvla_lib.policy.parameters import ParameterError, digest, shapes_of
 
 pytestmark = pytest.mark.unit
 SHAPES = {"weight": (5, 3), "bias": (3,), "gain": ()}
@@ -33,9 +46,9 @@ def random_arrays(seed, scale=1.0):
 
 def reply_content(arrays, examples=10, loss=1.0):
     return {
-        wire.ARRAYS: wire.pack_arrays(arrays),
-        wire.METRICS: MetricRecord({wire.EXAMPLES: examples, "loss": loss, "seconds": 0.1}),
-        wire.NOTE: wire.note(sha256=digest(arrays)),
+        ARRAYS: pack_arrays(arrays),
+        METRICS: MetricRecord({EXAMPLES: examples, "loss": loss, "seconds": 0.1}),
+        NOTE: make_note(sha256=digest(arrays)),
     }
 
 
@@ -45,7 +58,7 @@ def answering(content_of) -> ClientApp:
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
-        arrays = wire.unpack_arrays(message.content[wire.ARRAYS])
+        arrays = unpack_arrays(message.content[ARRAYS])
         content = content_of(context.node_config["partition-id"], arrays)
         return Message(RecordDict(content), reply_to=message)
 
@@ -72,13 +85,13 @@ def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, an
     options = {"shapes": SHAPES, "report": events.log, "keep_rollouts": lambda *_: None, **options}
     config = config or Config()
     options.setdefault("clip_norm", config.clip_norm)
-    strategy = strategies.build(config, {node: 1 / num_clients for node in nodes}, roster=roster, **options)
+    strategy = build.build_strategy(config, {node: 1 / num_clients for node in nodes}, roster=roster, **options)
     start = start or random_arrays(99)
-    messages = strategy.configure_train(server_round, wire.pack_arrays(start), ConfigRecord(), grid)
+    messages = strategy.configure_train(server_round, pack_arrays(start), ConfigRecord(), grid)
     replies = grid.send_and_receive(messages)
     replies = replies[::-1] if reverse else replies
     arrays, metrics = strategy.aggregate_train(server_round, replies)
-    return wire.unpack_arrays(arrays), metrics, events
+    return unpack_arrays(arrays), metrics, events
 
 
 def test_aggregation_equals_a_float64_reference():
@@ -159,8 +172,8 @@ GOOD = random_arrays(1)
 
 def _with_bias(content, dtype="float32", shape=(3,)):
     """A good reply but for the bytes of one array."""
-    record = ArrayRecord({**wire.pack_arrays(GOOD), "bias": Array(dtype, shape, "numpy.ndarray", content)})
-    return {**reply_content(GOOD), wire.ARRAYS: record}
+    record = ArrayRecord({**pack_arrays(GOOD), "bias": Array(dtype, shape, "numpy.ndarray", content)})
+    return {**reply_content(GOOD), ARRAYS: record}
 
 
 def _npz():
@@ -215,16 +228,16 @@ FAULTS = {
     "numbers of no bytes": ("dtype", lambda: _with_bias(_claiming(HUGE, "<U0"), "<U0", HUGE)),
     "another type than declared": ("dtype", lambda: _with_bias(_claiming((3,), "<i4"))),
     "bytes too many": ("shape", lambda: _with_bias(_claiming((3,)) + b"more")),
-    "wrong hash": ("hash", lambda: {**reply_content(GOOD), wire.NOTE: wire.note(sha256=hashlib.sha256().hexdigest())}),
-    "no hash": ("hash", lambda: _without(reply_content(GOOD), wire.NOTE)),
-    "no arrays": ("names", lambda: _without(reply_content(GOOD), wire.ARRAYS)),
-    "no metrics": ("metrics", lambda: _without(reply_content(GOOD), wire.METRICS)),
+    "wrong hash": ("hash", lambda: {**reply_content(GOOD), NOTE: make_note(sha256=hashlib.sha256().hexdigest())}),
+    "no hash": ("hash", lambda: _without(reply_content(GOOD), NOTE)),
+    "no arrays": ("names", lambda: _without(reply_content(GOOD), ARRAYS)),
+    "no metrics": ("metrics", lambda: _without(reply_content(GOOD), METRICS)),
     "zero examples": ("examples", lambda: reply_content(GOOD, examples=0)),
     "negative examples": ("examples", lambda: reply_content(GOOD, examples=-5)),
     "infinite loss": ("metrics", lambda: reply_content(GOOD, loss=float("inf"))),
     "extra metric": (
         "metrics",
-        lambda: {**reply_content(GOOD), wire.METRICS: MetricRecord({wire.EXAMPLES: 1, "loss": 1.0, "vote": 9.0})},
+        lambda: {**reply_content(GOOD), METRICS: MetricRecord({EXAMPLES: 1, "loss": 1.0, "vote": 9.0})},
     ),
     "exception": ("error", _raise),
 }
@@ -329,7 +342,7 @@ def test_a_client_that_never_answers_is_reported():
     grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
     strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None)
-    messages = strategy.configure_train(1, wire.pack_arrays(GOOD), ConfigRecord(), grid)
+    messages = strategy.configure_train(1, pack_arrays(GOOD), ConfigRecord(), grid)
     strategy.aggregate_train(1, grid.send_and_receive(messages)[:1])
     assert events.rejected() == {"client_1": "silent"}
 
@@ -389,7 +402,7 @@ def test_messages_carry_the_hash_that_clients_check():
 
     @app.train()
     def train(message, context):
-        arrays = wire.checked_arrays(message.content, wire.CONFIG, shapes_of(GOOD))
+        arrays = checked_arrays(message.content, CONFIG, shapes_of(GOOD))
         return Message(RecordDict(content(0, arrays)), reply_to=message)
 
     _, _, events = one_round(app, 2, start=GOOD)
@@ -403,7 +416,9 @@ def statistics(count, **changed):
     return {"observation.state": good, "action": {**good, **changed}}
 
 
-def introducing(partition_of, stats_of=lambda k, frames: wire.pack_stats(statistics(frames)), **said) -> ClientApp:
+def introducing(
+    partition_of, stats_of=lambda k, frames: normalisation.pack_stats(statistics(frames)), **said
+) -> ClientApp:
     """A ClientApp whose introduction is good, but for `said` of the node of partition 1."""
     app = ClientApp()
 
@@ -411,18 +426,20 @@ def introducing(partition_of, stats_of=lambda k, frames: wire.pack_stats(statist
     def query(message, context):
         k = context.node_config["partition-id"]
         values = {"partition_id": partition_of[k], "num_examples": 5 + k, "stats": stats_of(k, 5 + k)}
-        return Message(RecordDict({wire.NOTE: wire.note(**values | (said if k == 1 else {}))}), reply_to=message)
+        return Message(RecordDict({NOTE: make_note(**values | (said if k == 1 else {}))}), reply_to=message)
 
     return app
 
 
 def _without_measure(name):
-    return json.dumps({key: _without(of, name) for key, of in json.loads(wire.pack_stats(statistics(6))).items()})
+    return json.dumps(
+        {key: _without(of, name) for key, of in json.loads(normalisation.pack_stats(statistics(6))).items()}
+    )
 
 
 def _action(**changed):
     """Statistics whose action is changed; values may be what NumPy would not write."""
-    stats = json.loads(wire.pack_stats(statistics(6)))
+    stats = json.loads(normalisation.pack_stats(statistics(6)))
     return json.dumps({**stats, "action": stats["action"] | changed})
 
 
@@ -472,7 +489,7 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     assert events.rejected() == {f"node_{FIRST_NODE_ID + 1}": reason}
     detail = events[0][3]["detail"]
     assert "\n" not in detail and (reason == "partition" or detail.startswith("client_1: "))
-    pooled = data.pool_stats([one.stats for one in introductions])
+    pooled = normalisation.pool_stats([one.stats for one in introductions])
     assert pooled["action"]["count"].tolist() == [5 + 7]
     np.testing.assert_array_equal(pooled["action"]["std"], np.ones(6))
 
@@ -482,8 +499,8 @@ def test_joints_that_never_move_can_be_pooled(value):
     """Rounding puts the mean of equal numbers a little beside them."""
 
     def stats_of(k, frames):
-        measured = data._describe(np.full((frames, 6), value, np.float32))
-        return wire.pack_stats({"observation.state": measured, "action": measured})
+        measured = normalisation._describe(np.full((frames, 6), value, np.float32))
+        return normalisation.pack_stats({"observation.state": measured, "action": measured})
 
     events = Events()
     grid = InlineGrid(introducing(range(60), stats_of), 60, {})
@@ -507,9 +524,9 @@ def test_missing_clients_are_named_with_the_remedy():
 
 @pytest.mark.parametrize("name", ["../evil.mp4", "rollout_1.py", "/tmp/rollout_1.mp4", "rollout_a/b.mp4"])
 def test_a_client_cannot_choose_where_the_server_writes(name):
-    note = wire.note(rollouts="[]", file_names=[name], files=[b"x"])
+    note = make_note(rollouts="[]", file_names=[name], files=[b"x"])
     with pytest.raises(ValueError, match="expected files rollout_"):
-        wire.unpack_rollouts(RecordDict({wire.NOTE: note}))
+        unpack_rollouts(RecordDict({NOTE: note}))
 
 
 @pytest.mark.parametrize(
@@ -522,6 +539,6 @@ def test_a_client_cannot_choose_where_the_server_writes(name):
 )  # fmt: skip
 def test_rollouts_that_cannot_be_kept_are_refused(said):
     good = {"rollouts": '[{"video": "rollout_1.mp4"}]', "file_names": ["rollout_1.mp4"], "files": [b"x"]}
-    wire.unpack_rollouts(RecordDict({wire.NOTE: wire.note(**good)}))
+    unpack_rollouts(RecordDict({NOTE: make_note(**good)}))
     with pytest.raises(ParameterError, match="rollout"):
-        wire.unpack_rollouts(RecordDict({wire.NOTE: wire.note(**good | said)}))
+        unpack_rollouts(RecordDict({NOTE: make_note(**good | said)}))

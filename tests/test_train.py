@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from fedvla_lib import config as configs
-from fedvla_lib import model, train, wire
-from fedvla_lib.params import load_arrays, trainable, trainable_arrays
-from fedvla_lib.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
+from fedvla_lib.config import from_profile
+from fedvla_lib.evaluation.held_out import validate
+from fedvla_lib.federation import messages
+from fedvla_lib.policy import model, training
+from fedvla_lib.policy.parameters import load_arrays, trainable, trainable_arrays
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
-CONFIG = configs.from_profile("tiny", base="nano-random", checkpoint_every=2, num_threads=1, train_expert_only=False)
+CONFIG = from_profile("tiny", base="nano-random", checkpoint_every=2, num_threads=1, train_expert_only=False)
 STATS = {key: {"mean": np.full(6, 10.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
 
 
@@ -45,7 +47,7 @@ def same(left, right):
 
 def run(steps, **kwargs):
     bundle = model.load_policy(CONFIG, STATS)
-    result = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=steps, progress=False, **kwargs)
+    result = training.local_train(bundle, SyntheticBatches(), CONFIG, steps=steps, progress=False, **kwargs)
     return bundle, result
 
 
@@ -61,7 +63,7 @@ def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
 
     broken = model.load_policy(CONFIG, STATS)
     with pytest.raises(KeyboardInterrupt):
-        train.local_train(broken, Dies(), CONFIG, steps=6, checkpoint_dir=tmp_path / "cut", progress=False)
+        training.local_train(broken, Dies(), CONFIG, steps=6, checkpoint_dir=tmp_path / "cut", progress=False)
     assert [p.name for p in sorted((tmp_path / "cut").iterdir())] == ["step_000002", "step_000004"]
     resumed, resumed_result = run(6, checkpoint_dir=tmp_path / "cut", resume=True)
     assert resumed_result.losses == whole_result.losses
@@ -85,7 +87,7 @@ def test_only_what_is_trainable_changes(frozen):
     config = replace(CONFIG, train_expert_only=frozen, freeze_vision_encoder=True)
     bundle = model.load_policy(config, STATS)
     before = weights(bundle)
-    train.local_train(bundle, SyntheticBatches(), config, steps=2, progress=False)
+    training.local_train(bundle, SyntheticBatches(), config, steps=2, progress=False)
     changed = {name for name, p in bundle.policy.named_parameters() if not torch.equal(before[name], p)}
     trainable = {name for name, p in bundle.policy.named_parameters() if p.requires_grad}
     assert changed <= trainable
@@ -99,9 +101,9 @@ def test_training_lowers_the_held_out_loss():
     config = replace(CONFIG, lr=3e-3, warmup_steps=2)
     bundle = model.load_policy(config, STATS)
     held_out = [SyntheticBatches().at(10_000 + i) for i in range(4)]
-    before = train.validate(bundle, held_out, tolerance=5.0)
-    train.local_train(bundle, SyntheticBatches(), config, steps=40, progress=False)
-    after = train.validate(bundle, held_out, tolerance=5.0)
+    before = validate(bundle, held_out, tolerance=5.0)
+    training.local_train(bundle, SyntheticBatches(), config, steps=40, progress=False)
+    after = validate(bundle, held_out, tolerance=5.0)
     assert after["loss"] < 0.8 * before["loss"]
     assert after["action_error"] < before["action_error"]
 
@@ -110,24 +112,24 @@ def test_training_lowers_the_held_out_loss():
 def test_validation_is_deterministic_and_ignores_padded_actions():
     bundle = model.load_policy(CONFIG, STATS)
     held_out = [SyntheticBatches().at(0)]
-    first = train.validate(bundle, held_out, tolerance=5.0)
+    first = validate(bundle, held_out, tolerance=5.0)
     held_out[0][ACTION_KEY][0, -3:] = 1e6
-    assert train.validate(bundle, held_out, tolerance=5.0) == first
+    assert validate(bundle, held_out, tolerance=5.0) == first
     with pytest.raises(ValueError, match="held-out"):
-        train.validate(bundle, [], tolerance=5.0)
+        validate(bundle, [], tolerance=5.0)
 
 
 @pytest.mark.unit
 def test_schedule_continues_where_the_last_round_stopped():
     bundle = model.load_policy(CONFIG, STATS)
     config = replace(CONFIG, lr=1e-2, warmup_steps=4)
-    whole, whole_schedule = train._optimizer(bundle, config, 0, 20)
+    whole, whole_schedule = training._optimizer(bundle, config, 0, 20)
     rates = []
     for _ in range(20):
         rates.append(whole.param_groups[0]["lr"])
         whole.step()
         whole_schedule.step()
-    later, later_schedule = train._optimizer(bundle, config, 7, 20)
+    later, later_schedule = training._optimizer(bundle, config, 7, 20)
     for expected in rates[7:]:
         assert later.param_groups[0]["lr"] == pytest.approx(expected)
         later.step()
@@ -141,7 +143,7 @@ def test_a_diverging_loss_stops_with_a_clear_line():
             return {**super().at(step), STATE_KEY: torch.full((4, 6), float("nan"))}
 
     with pytest.raises(FloatingPointError, match="step 0: lower lr"):
-        train.local_train(model.load_policy(CONFIG, STATS), Poison(), CONFIG, steps=1, progress=False)
+        training.local_train(model.load_policy(CONFIG, STATS), Poison(), CONFIG, steps=1, progress=False)
 
 
 def _decay(bundle, batch):
@@ -153,13 +155,13 @@ def _decay(bundle, batch):
 def test_a_kept_optimiser_state_makes_two_phases_equal_to_one():
     whole, parts, fresh = (model.load_policy(CONFIG, STATS) for _ in range(3))
     common = {"total_steps": 6, "progress": False, "loss": _decay}
-    train.local_train(whole, SyntheticBatches(), CONFIG, steps=6, **common)
-    first = train.local_train(parts, SyntheticBatches(), CONFIG, steps=2, moments={}, **common)
-    travelled = wire.unpack_arrays(wire.pack_arrays(first.moments))  # as a client's context keeps it
-    train.local_train(parts, SyntheticBatches(), CONFIG, steps=4, start_step=2, moments=travelled, **common)
+    training.local_train(whole, SyntheticBatches(), CONFIG, steps=6, **common)
+    first = training.local_train(parts, SyntheticBatches(), CONFIG, steps=2, moments={}, **common)
+    travelled = messages.unpack_arrays(messages.pack_arrays(first.moments))  # as a client's context keeps it
+    training.local_train(parts, SyntheticBatches(), CONFIG, steps=4, start_step=2, moments=travelled, **common)
     assert same(weights(whole), weights(parts))
     for steps, start in ((2, 0), (4, 2)):
-        result = train.local_train(fresh, SyntheticBatches(), CONFIG, steps=steps, start_step=start, **common)
+        result = training.local_train(fresh, SyntheticBatches(), CONFIG, steps=steps, start_step=start, **common)
         assert result.moments == {}  # nobody asked for it
     assert not same(weights(whole), weights(fresh))
 
@@ -167,15 +169,15 @@ def test_a_kept_optimiser_state_makes_two_phases_equal_to_one():
 @pytest.mark.unit
 def test_a_kept_optimiser_state_survives_a_resume(tmp_path):
     bundle = model.load_policy(CONFIG, STATS)
-    before = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, moments={}, progress=False).moments
+    before = training.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, moments={}, progress=False).moments
     started = trainable_arrays(bundle.policy)
     settings = {"start_step": 2, "total_steps": 6, "moments": before, "progress": False}
-    whole = train.local_train(bundle, SyntheticBatches(), CONFIG, steps=4, **settings)
+    whole = training.local_train(bundle, SyntheticBatches(), CONFIG, steps=4, **settings)
     expected = weights(bundle)
     load_arrays(bundle.policy, started)
-    train.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, checkpoint_dir=tmp_path, **settings)
+    training.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, checkpoint_dir=tmp_path, **settings)
     load_arrays(bundle.policy, started)
-    again = train.local_train(
+    again = training.local_train(
         bundle, SyntheticBatches(), CONFIG, steps=4, checkpoint_dir=tmp_path, resume=True, **settings
     )
     assert same(expected, weights(bundle))

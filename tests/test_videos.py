@@ -7,9 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fedvla_lib import engine, evaluate, run_folder, videos
-from fedvla_lib.cli import main
+from fedvla_lib import run_folder
+from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile
+from fedvla_lib.engines import inline
+from fedvla_lib.evaluation import video, video_report
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
@@ -20,7 +22,7 @@ def run(recording, tmp_path_factory):
         "tiny", base="nano", data=str(recording), num_clients=2, num_server_rounds=1, local_steps=1, eval_rollouts=1,
         eval_every=1, client_rollouts=1, num_threads=1,
     )  # fmt: skip
-    return engine.run_inline(replace(tiny, out=str(tmp_path_factory.mktemp("run"))), progress=False)
+    return inline.run_inline(replace(tiny, out=str(tmp_path_factory.mktemp("run"))), progress=False)
 
 
 def test_what_the_films_say_is_what_the_run_measured(run, tmp_path, capsys):
@@ -41,7 +43,7 @@ def test_damaged_files_are_listed_and_the_rest_is_counted(run, tmp_path, capsys)
     films = sorted(folder.rglob("*.mp4"))
     films[0].write_bytes(films[0].read_bytes()[:200])
     films[1].with_suffix(".npz").unlink()
-    films[2].write_bytes(evaluate.encode_video(evaluate.read_video(films[2])[:-3]))  # plays, but ends too early
+    films[2].write_bytes(video.encode_video(video.read_video(films[2])[:-3]))  # plays, but ends too early
     films[3].with_suffix(".npz").write_bytes(b"PK")
     assert main(["videos", str(folder)]) == 1
     said = capsys.readouterr()
@@ -64,5 +66,5 @@ def test_bad_input_is_one_line(run, tmp_path, capsys):
 
 def test_a_round_without_a_success_has_no_completion_time():
     rows = pd.DataFrame({"round": [0, 0], "success": [False, False], "completion_time": [np.nan, np.nan]})
-    (line,) = videos.by_round(rows, "completion_time").to_dict("records")
+    (line,) = video_report.trend_by_round(rows, "completion_time").to_dict("records")
     assert line["n"] == 0 and np.isnan(line["value"])

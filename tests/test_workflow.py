@@ -7,7 +7,8 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from fedvla_lib import corrections, workflow
+from fedvla_book import checklist
+from fedvla_lib.federation.strategies import fedprox
 
 pytestmark = pytest.mark.unit
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
@@ -15,20 +16,20 @@ LINES = 60  # more than a reader takes in at once
 
 
 def test_a_tick_needs_a_test_that_holds():
-    shown = repr(workflow.checklist(data=True, global_update=True))
+    shown = repr(checklist.checklist(data=True, global_update=True))
     assert shown.count("☑") == 2 and "☑ data" in shown and "☑ global update" in shown and "☐ model" in shown
     with pytest.raises(AssertionError, match="'training'"):
-        workflow.checklist(data=True, training=False)
+        checklist.checklist(data=True, training=False)
     with pytest.raises(ValueError, match="'dta'.*environment"):
-        workflow.checklist(dta=True)
+        checklist.checklist(dta=True)
 
 
 def test_what_is_shown_is_what_runs_and_only_the_librarys():
-    shown = workflow.show(corrections.Proximal)._repr_markdown_()
-    module = Path(corrections.__file__).read_text()
+    shown = checklist.show(fedprox.Proximal)._repr_markdown_()
+    module = Path(training.__file__).read_text()
     assert shown.startswith("```python\nclass Proximal") and shown.removeprefix("```python\n")[:-3] in module
     with pytest.raises(ValueError, match="Path is of pathlib"):
-        workflow.show(Path)
+        checklist.show(Path)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -50,14 +51,14 @@ def test_a_chapter_shows_the_source_of_what_it_teaches(path):
 
 def _lines(module, name):
     """How long a function or class of the library is."""
-    body = ast.parse((Path(inspect.getfile(workflow)).parent / f"{module}.py").read_text()).body
+    body = ast.parse((Path(inspect.getfile(checklist)).parent / f"{module}.py").read_text()).body
     (found,) = [node for node in body if getattr(node, "name", "") == name]
     return found.end_lineno - found.lineno + 1
 
 
 def test_no_chapter_retypes_a_function_of_the_library():
     library = set()
-    for module in Path(inspect.getfile(workflow)).parent.glob("*.py"):
+    for module in Path(inspect.getfile(checklist)).parent.glob("*.py"):
         functions = [node for node in ast.walk(ast.parse(module.read_text())) if isinstance(node, ast.FunctionDef)]
         library |= {ast.dump(node) for node in functions}
     for path in NOTEBOOKS:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fedvla_lib.exercises import close, expect
+from fedvla_book.exercises import close, expect
 
 
 def points(difference: Callable[[float, float], float]) -> None:

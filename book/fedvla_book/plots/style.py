@@ -1,0 +1,67 @@
+"""Colours and figure style of the book.
+
+Figures have an opaque white ground so that they stay readable on a dark page; colours are Okabe and Ito's, which remain
+distinct for colour-blind readers. One method and one client keep one colour throughout the book: ask `method_color` and
+`client_color`; other things that are told apart in one figure only take the palette in its order.
+"""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+from fedvla_lib.evaluation.figures import PALETTE, WIDTH
+
+METHOD_COLORS = {"base": "#7F7F7F", "local-only": "#E69F00", "federated": "#0072B2", "centralized": "#009E73"}
+METHOD_FAMILIES = {  # what a stored arm's name begins with -> its colour; a cadence or an addition follows the name
+    **METHOD_COLORS,
+    "fedavg": METHOD_COLORS["federated"],
+    "fedavg-10x4x20": "#56B4E9",
+    "scaffold": "#D55E00",
+    "fedprox": "#CC79A7",
+}
+DASHES = ("-", "--", "-.")
+# Okabe and Ito's, then two of Tol's muted scheme: ten clients is what a federation of this book has.
+CLIENT_COLORS = (*PALETTE[:6], "#117733", "#000000", "#882255", "#7F7F7F")
+STYLE = {
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "axes.facecolor": "white",
+    "axes.grid": True,
+    "axes.axisbelow": True,  # bars cover the grid
+    "grid.color": "#DDDDDD",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "figure.dpi": 110,
+    "font.size": 10,
+    "axes.prop_cycle": plt.cycler(color=PALETTE),
+}
+
+
+def use_style() -> None:
+    """Apply the book's figure style to this session."""
+    plt.rcParams.update(STYLE)
+
+
+def method_color(arm: str, other: int = 0) -> str:
+    """Return the colour of an arm throughout the book; one without its own takes number `other` of the palette."""
+    name = arm.lower().replace(", ", "-") + "-"
+    own = [color for family, color in METHOD_FAMILIES.items() if name.startswith(f"{family}-")]
+    return own[-1] if own else PALETTE[other % len(PALETTE)]
+
+
+def client_color(client: int) -> str:
+    """Return the colour of a client throughout the book, by its number; ten differ."""
+    return CLIENT_COLORS[client % len(CLIENT_COLORS)]
+
+
+def legend_above(axes: Sequence[Axes]) -> None:
+    """One legend for panels that share their labels, above all of them."""
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside upper center")
+
+
+def joint_axes() -> Sequence[Axes]:
+    """A panel per joint, two side by side: three would be too small on a page."""
+    _, grid = plt.subplots(3, 2, figsize=(WIDTH, 6.2), sharex=True, layout="constrained")
+    return grid.ravel()

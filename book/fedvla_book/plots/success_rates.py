@@ -1,0 +1,145 @@
+"""Figures of success rates with their intervals."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from fedvla_book.plots.style import method_color
+from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
+
+
+def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw success rates with their intervals; columns arm, task, success_rate, low, high."""
+    ax = ax or new_axes()
+    arms, tasks = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.task))
+    width = 0.8 / len(arms)
+    for i, arm in enumerate(arms):
+        part = table[table.arm == arm].set_index("task").loc[tasks]
+        errors = np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
+        place = np.arange(len(tasks)) + (i - (len(arms) - 1) / 2) * width
+        ax.bar(place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=arm, color=method_color(arm, i))
+    ax.set_xticks(range(len(tasks)), tasks)
+    ax.set_ylim(0, 1.02)
+    ax.set_xlabel("task")
+    ax.set_ylabel("success rate (95 % interval)")
+    ax.legend(frameon=False, ncols=len(arms), loc="upper center", bbox_to_anchor=(0.5, 1.14))
+    return ax
+
+
+def rollout_grid(rows: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw who succeeded when: a square per client and round with its task; columns who, round, task, success."""
+    who, rounds = list(dict.fromkeys(rows.who)), sorted(rows["round"].unique())
+    if ax is None:
+        _, ax = plt.subplots(figsize=(2.6 + 1.3 * len(rounds), 0.42 * len(who) + 1.2), layout="constrained")
+    for (name, number), group in rows.groupby(["who", "round"]):
+        x, y, share = rounds.index(number), who.index(name), group.success.mean()
+        color = PALETTE[2] if share == 1 else PALETTE[1] if share == 0 else PALETTE[4]
+        ax.add_patch(plt.Rectangle((x - 0.45, y - 0.4), 0.9, 0.8, color=color, alpha=0.35))
+        text = f"{', '.join(dict.fromkeys(group.task))}\n{int(group.success.sum())}/{len(group)}"
+        ax.text(x, y, text, ha="center", va="center", fontsize=8)
+    ax.set_xlim(-0.6, len(rounds) - 0.4)
+    ax.set_ylim(len(who) - 0.4, -0.6)
+    ax.set_xticks(range(len(rounds)), rounds)
+    ax.set_yticks(range(len(who)), who)
+    ax.grid(False)
+    ax.set_xlabel("round")
+    ax.set_ylabel("where the rollouts ran")
+    return ax
+
+
+def interval_width(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw the width of an interval against the number of rollouts; columns n, width, success_rate (one line each)."""
+    ax = ax or new_axes()
+    for rate, part in table.groupby("success_rate"):
+        ax.plot(part.n, 100 * part.width, "o-", label=f"{rate:.0%} succeed")
+    ax.set_xscale("log")
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("number of rollouts (logarithmic)")
+    ax.set_ylabel("width of the 95 % interval [points]")
+    ax.legend(frameon=False)
+    return ax
+
+
+def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw how often a difference is detected against the rollouts per model; columns n, power, difference."""
+    ax = ax or new_axes()
+    for difference, part in table.groupby("difference"):
+        ax.plot(part.n, part.power, "o-", label=f"true difference {100 * difference:.0f} points")
+    ax.axhline(0.8, color="#555555", linestyle=":", linewidth=1)
+    ax.set_xscale("log")
+    ax.set_ylim(0, 1.02)
+    ax.set_xlabel("rollouts per model (logarithmic)")
+    ax.set_ylabel("share of experiments that see it")
+    ax.legend(frameon=False)
+    return ax
+
+
+def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes | None = None) -> Axes:
+    """Draw a success rate with its interval for each line; columns arm, partition, success_rate, low, high.
+
+    A partition has a colour and a place within the arm's row, so that arms can be compared in each.
+    """
+    arms, partitions = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.partition))
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 1.2 + 0.3 * len(arms) + 0.1 * len(table)), layout="constrained")
+    for i, partition in enumerate(partitions):
+        part = table[table.partition == partition]
+        rows = np.array([arms.index(arm) for arm in part.arm]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
+        errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
+        if len(partitions) == 1:  # then the colours are the arms'
+            for row, rate, error, arm in zip(rows, 100 * part.success_rate, errors.T, part.arm, strict=True):
+                look = {"fmt": "o", "capsize": 3, "color": method_color(arm, int(row))}
+                ax.errorbar(rate, row, xerr=error[:, None], **look)
+            continue
+        color = PALETTE[i % len(PALETTE)]
+        ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
+    ax.set_yticks(range(len(arms)), arms)
+    ax.set_ylim(len(arms) - 0.5, -0.5)
+    ax.set_xlim(-2, 102)
+    ax.set_xlabel("success rate [%], 95 % interval")
+    ax.set_ylabel(ylabel)
+    if len(partitions) > 1:
+        at = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+        ax.legend(frameon=False, ncols=len(partitions), title="partition", **at)
+    return ax
+
+
+def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw success against what travelled, a labelled point a line; columns arm, MB, success_rate, low, high.
+
+    Points of equal MB would hide each other: they stand side by side, around their place.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 4.6), layout="constrained")
+    alike = table.groupby(table.MB.round()).cumcount()
+    middle = (table.groupby(table.MB.round()).MB.transform("size") - 1) / 2
+    places = table.MB * 1.08 ** (alike - middle)
+    for i, (place, row) in enumerate(zip(places, table.itertuples(), strict=True)):
+        errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
+        color, marker = method_color(row.arm, i), "osD^vP*X"[(i + i // 8) % 8]
+        ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
+    ax.set_xscale("log")
+    ax.set_ylim(-2, 102)
+    ax.set_xlabel("everything that travelled [MB], equals side by side")
+    ax.set_ylabel("success rate [%], 95 % interval")
+    ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    return ax
+
+
+def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw points of success for each megabyte that travelled, a bar an arm; columns arm, MB, success_rate, low, high.
+
+    The interval is that of the success rate, divided by the bytes, which are known exactly.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(WIDTH, 1.0 + 0.3 * len(table)), layout="constrained")
+    points = {name: 100 * table[name] / table.MB for name in ("success_rate", "low", "high")}
+    errors = np.stack([points["success_rate"] - points["low"], points["high"] - points["success_rate"]])
+    places = np.arange(len(table))
+    ax.barh(places, points["success_rate"], xerr=np.abs(errors), capsize=3, color=PALETTE[0])
+    ax.set_yticks(places, table.arm)
+    ax.set_ylim(len(table) - 0.5, -0.5)
+    ax.set_xlabel("success rate for what travelled [points per MB], 95 % interval")
+    ax.set_ylabel("what travels")
+    return ax

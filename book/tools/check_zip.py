@@ -1,0 +1,125 @@
+"""Execute chapters as their readers do who took the zip: unpacked in an empty folder, from the library's wheel.
+
+    python book/tools/check_zip.py              every chapter, at the profile tiny
+    python book/tools/check_zip.py --only 02
+    python book/tools/check_zip.py -n 2         what it does not know itself is for pytest: here, two chapters at a time
+
+The environment is a new one that sees the packages of this one, but not the source of the library. pytest --nbmake runs
+in it. Recordings in the cache are used again.
+"""
+
+import argparse
+import os
+import shlex
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from zipfile import ZipFile
+
+import nbformat
+
+import make_zip
+
+CELL_TIMEOUT_S = 300
+# The last cell of each: the kernel is the new environment's, and so is the library that the chapter used.
+FROM_THE_WHEEL = """import sys
+from pathlib import Path
+
+import fedvla_lib
+
+installed = Path(fedvla_lib.__file__).is_relative_to(sys.prefix)
+assert installed and sys.prefix == {prefix!r}, f"{{fedvla_lib.__file__}}, run by {{sys.prefix}}"
+"""
+PROGRAM = "#!{python}\nimport sys\n\nfrom {module} import {attribute}\n\nsys.exit({attribute}())\n"
+
+
+def unpack(book: Path, folder: Path) -> Path:
+    """Unpack the zip and return the folder that it makes."""
+    with ZipFile(book) as packed:
+        packed.extractall(folder)
+    return folder / book.stem
+
+
+def new_environment(book: Path) -> Path:
+    """Make an environment in an unpacked book and return its Python: the wheel, and the packages that are here.
+
+    A .pth file in the folder of packages that it points to is not read, so an editable install is not followed.
+    """
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(book / ".venv")], check=True)
+    python = book / ".venv" / "bin" / "python"
+    (packages,) = (book / ".venv").glob("lib/python*/site-packages")
+    (wheel,) = book.glob("*.whl")
+    with ZipFile(wheel) as library:
+        library.extractall(packages)
+    (packages / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    for program in entry_points(group="console_scripts"):
+        if program.module.split(".")[0] in ("flwr", "fedvla_lib"):  # what chapters start
+            text = PROGRAM.format(python=python, module=program.module, attribute=program.attr)
+            (python.parent / program.name).write_text(text)
+            (python.parent / program.name).chmod(0o755)
+    return python
+
+
+def surroundings(python: Path) -> dict[str, str]:
+    """Return the environment variables of a shell in which that Python's environment is the active one.
+
+    Each chapter computes on one thread, so that several can run at a time.
+    """
+    outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    path = f"{python.parent}{os.pathsep}{outside['PATH']}"
+    return {"OMP_NUM_THREADS": "1"} | outside | {"FEDVLA_PROFILE": "tiny", "PATH": path}
+
+
+def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()) -> int:
+    """Execute chapters of an unpacked book with `pytest --nbmake`, each in its own folder, and return its exit status.
+
+    A chapter also fails if its library did not come from the environment of `python`.
+    """
+    for notebook in notebooks:
+        content = nbformat.read(notebook, as_version=4)
+        content.cells.append(nbformat.v4.new_code_cell(FROM_THE_WHEEL.format(prefix=str(python.parents[1]))))
+        nbformat.write(content, notebook)
+    book = python.parents[2]
+    alone = ["-c", os.devnull, "--rootdir", str(book), "-p", "no:cacheprovider"]  # no settings of folders above
+    nbmake = ["--nbmake", "--nbmake-timeout", str(CELL_TIMEOUT_S), "--durations", "0", *options]
+    command = [str(python), "-m", "pytest", *alone, *nbmake, *map(str, notebooks)]
+    return subprocess.run(command, cwd=book, env=surroundings(python), check=False).returncode
+
+
+def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
+    """Execute the chapters whose name contains `only` in an empty folder; return pytest's exit status.
+
+    Raises:
+        ValueError: there is no such chapter, or the demonstrations could not be recorded.
+    """
+    book = unpack(make_zip.make(make_zip.ROOT, folder / "fedvla-book.zip"), folder)
+    notebooks = [path for path in sorted((book / "notebooks").glob("*.ipynb")) if only in path.stem]
+    if not notebooks:
+        raise ValueError(f"no chapter of the zip has {only!r} in its name")
+    notebooks.reverse()  # the last are the longest: side by side, none is left when the others are done
+    python = new_environment(book)
+    record = [str(python.parent / "fedvla"), "record", "--profile", "tiny"]  # as the zip's README says
+    if subprocess.run(record, cwd=book, env=surroundings(python), check=False).returncode:
+        raise ValueError(f"{shlex.join(record[1:])} failed in the unpacked book")
+    return execute(notebooks, python, options)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Check the zip; pytest says what each chapter took."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
+    parser.add_argument("--only", default="", metavar="TEXT", help="the chapters whose name contains TEXT")
+    known, options = parser.parse_known_args(argv)
+    try:
+        with tempfile.TemporaryDirectory(prefix="fedvla-check-") as folder:
+            return check(Path(folder), known.only, options)
+    except (ValueError, OSError) as error:
+        print(f"check_zip: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""Keep what the last build measured of each chapter, for the boxes at their tops.
+
+    python book/tools/keep_costs.py --profile laptop
+
+Reads the executed copies of `make book` and writes `book/reference/costs/<profile>.json`. Measure on a machine that
+does nothing else.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+
+from build_book import toc_pages
+from fedvla_book.chapter_cost import MEASURED
+from fedvla_lib.config import PROFILES
+from fedvla_lib.files import write_json
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def measured_in(executed: Path) -> dict[str, float | None]:
+    """Return seconds, memory and bytes of an executed chapter; None for what it does not say.
+
+    Raises:
+        ValueError: the copy was not made by a build of the book, or not alone.
+    """
+    notebook = nbformat.read(executed, as_version=4)
+    if "fedvla" not in notebook.metadata:
+        raise ValueError(f"{executed.name} was not executed by make book")
+    if (together := notebook.metadata["fedvla"].get("at_a_time", 1)) > 1:
+        raise ValueError(f"{executed.name} was executed with {together} at a time: remove it, and run make book first")
+    said = [
+        output["metadata"][MEASURED]
+        for cell in notebook.cells
+        for output in cell.get("outputs", [])
+        if MEASURED in output.get("metadata", {})
+    ]
+    last = said[-1] if said else {}
+    costs = {name: last.get(name) for name in ("memory_mb", "exchanged_mb")}
+    return {"seconds": notebook.metadata["fedvla"]["seconds"], **costs}
+
+
+def keep(root: Path, profile: str) -> Path:
+    """Write what the build at `profile` measured and return the file.
+
+    Raises:
+        ValueError: a chapter of the contents was not executed; nothing is written then.
+    """
+    folder = root / "_build" / profile / "executed"
+    files = [folder / f"{Path(page).name}.ipynb" for page in toc_pages(root) if page.startswith("notebooks/")]
+    if missing := [file.stem for file in files if not file.is_file()]:
+        raise ValueError(f"not executed at profile {profile}: {', '.join(missing)}; run make book first")
+    date = time.strftime("%Y-%m-%d", time.gmtime(max(file.stat().st_mtime for file in files)))
+    chapters = {file.stem: measured_in(file) for file in files}
+    target = root / "book" / "reference" / "costs" / f"{profile}.json"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_json(target, {"cores": os.cpu_count(), "date": date, "chapters": chapters})
+    return target
+
+
+def main() -> int:
+    """Keep the measurements and say where."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--profile", choices=list(PROFILES), default=os.environ.get("FEDVLA_PROFILE", "laptop"))
+    try:
+        target = keep(ROOT, parser.parse_args().profile)
+    except ValueError as error:
+        print(f"keep_costs: {error}", file=sys.stderr)
+        return 2
+    print(target.relative_to(ROOT))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

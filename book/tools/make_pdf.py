@@ -1,0 +1,111 @@
+"""Print the book: the executed chapters and all other pages as one PDF.
+
+    python book/tools/make_pdf.py --profile laptop
+
+Chapters are not executed here, `make book` does that. Sphinx renders all pages as a single one, and the system's
+Chromium prints it; LaTeX would be a gigabyte more to install.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from build_book import CELL_TIMEOUT_S, BookError, Chapter, lay_out, library_key, reuse, toc_pages
+from check_site import FLAGS, _chromium
+
+ROOT = Path(__file__).resolve().parents[2]
+TARGET = "_build/fedvla-book.pdf"
+LOAD_S = 600  # a page with all figures and videos of the book
+MARGIN = {"top": "18mm", "bottom": "18mm", "left": "16mm", "right": "16mm"}
+SCALE = 0.75  # letters of a printed book, and lines of code that fit
+# On paper nothing scrolls, and what belongs together stays on one page.
+STYLE = """
+td, th { white-space: normal !important; }
+pre, pre code { white-space: pre-wrap !important; overflow-wrap: anywhere; }
+figure, img, video, tr, div.math, div.cell_input, div.admonition { break-inside: avoid; }
+div.cell, div.cell_output, .table-wrapper { overflow: visible !important; }
+h1, h2, h3, h4, summary { break-after: avoid; }
+section.mathjax_ignore > h2 { break-before: page; } /* a chapter */
+"""
+# On paper nothing can be opened, and a lazy picture that was never in view is blank.
+PREPARE = """async () => {
+  document.documentElement.dataset.mode = document.documentElement.dataset.theme = 'light';
+  document.querySelectorAll('details').forEach(one => { one.open = true; });
+  const images = [...document.images];
+  images.forEach(one => { one.loading = 'eager'; });
+  await Promise.all(images.map(one => one.decode().catch(() => 0)));
+}"""
+
+
+def executed_chapters(root: Path, profile: str) -> list[Chapter]:
+    """Return the executed copies that `make book` left.
+
+    Raises:
+        BookError: one is missing or older than what it was made from; the message names it.
+    """
+    library, folder = library_key(root, profile), root / "_build" / profile / "executed"
+    notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file()]
+    chapters = {path.stem: reuse(path, folder, library) for path in notebooks}
+    if stale := [name for name, chapter in chapters.items() if chapter is None]:
+        raise BookError(f"not executed at profile {profile}, or changed since: {', '.join(stale)}; run make book")
+    return list(chapters.values())
+
+
+def render_single(source: Path, output: Path) -> Path:
+    """Render a laid out book as a single page and return it; `make book` is where warnings are errors."""
+    command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
+    # Where site_scripts.py lies, and the library whose functions are described.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT)])}
+    done = subprocess.run(
+        [*command, "--builder", "singlehtml", "--quiet"], env=environment, capture_output=True, text=True, check=False
+    )
+    page = output / "_build" / "singlehtml" / f"{toc_pages(source)[0]}.html"
+    if done.returncode or not page.is_file():
+        raise BookError(f"jupyter-book made no single page: {' '.join(done.stderr.split())[-800:]}")
+    # Sphinx writes its addresses of styles and pictures as if it lay at the top.
+    return page.replace(output / "_build" / "singlehtml" / "printed.html")
+
+
+def print_page(page: Path, target: Path) -> Path:
+    """Print an HTML file with Chromium and return the PDF."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = target.with_name(target.name + ".unfinished")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
+        shown = browser.new_page()
+        shown.set_default_timeout(1000 * LOAD_S)
+        shown.goto(page.resolve().as_uri(), wait_until="networkidle")
+        shown.add_style_tag(content=STYLE)
+        shown.evaluate(PREPARE)
+        paper = {"format": "A4", "margin": MARGIN, "scale": SCALE}
+        shown.pdf(path=unfinished, print_background=True, outline=True, tagged=True, **paper)
+        browser.close()
+    return unfinished.replace(target)
+
+
+def make(root: Path, profile: str) -> Path:
+    """Print the book that was executed at `profile`."""
+    chapters, work = executed_chapters(root, profile), root / "_build" / profile / "single"
+    lay_out(root, work / "source", chapters, profile)
+    return print_page(render_single(work / "source", work), root / TARGET)
+
+
+def main() -> int:
+    """Make the PDF and say where it is."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
+    try:
+        target = make(ROOT, parser.parse_args().profile)
+    except (ValueError, OSError) as error:
+        print(f"make_pdf: {error}", file=sys.stderr)
+        return 2
+    print(f"{target} ({target.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

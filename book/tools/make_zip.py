@@ -1,0 +1,93 @@
+"""Pack the notebooks, the stored results that they read, and the library, for readers who do not use git.
+
+    python book/tools/make_zip.py
+
+The library is built by its own build backend, setuptools, which the environment has; nothing is downloaded.
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
+
+ROOT = Path(__file__).resolve().parents[2]
+TARGET = "_build/fedvla-book.zip"
+# Below one folder, as in the checkout: chapters read ../book/reference.
+PACKED = ["notebooks/*.ipynb", "book/reference/**/*", "requirements.lock", "LICENSE"]
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+README = """{title}
+
+The notebooks of the book, the stored results that they read, and the library. You need Python {python}.
+
+Install, in this folder:
+
+    python3 -m venv .venv
+    .venv/bin/python -m pip install --require-hashes -r requirements.lock
+    .venv/bin/python -m pip install --no-deps {wheel}
+
+See what the machine lacks, record the demonstrations (minutes), and start with chapter 1:
+
+    .venv/bin/fedvla doctor
+    .venv/bin/fedvla record
+    .venv/bin/jupyter lab notebooks
+"""
+
+
+def build_wheel(root: Path, folder: Path) -> Path:
+    """Build the library's wheel into `folder`, from a copy: setuptools leaves its build folders beside the source.
+
+    Raises:
+        ValueError: setuptools could not; the message is the end of what it said.
+    """
+    with tempfile.TemporaryDirectory(prefix="fedvla-wheel-") as name:
+        source = Path(name)
+        shutil.copytree(root / "fedvla_lib", source / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+        for file in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copy(root / file, source)
+        command = [sys.executable, "-c", BUILD, str(folder.resolve())]
+        done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise ValueError(f"the wheel was not built: {' '.join(done.stderr.split())[-400:]}")
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def make(root: Path, target: Path) -> Path:
+    """Write the zip and return it; what it holds lies in one folder named like it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = target.with_name(target.name + ".unfinished")
+    with tempfile.TemporaryDirectory(prefix="fedvla-zip-") as folder, ZipFile(unfinished, "w", ZIP_DEFLATED) as book:
+        wheel = build_wheel(root, Path(folder))
+        book.write(wheel, f"{target.stem}/{wheel.name}")
+        for path in _packed(root):
+            book.write(path, f"{target.stem}/{path.relative_to(root).as_posix()}")
+        book.writestr(f"{target.stem}/README.txt", _readme(root, wheel.name))
+    return unfinished.replace(target)
+
+
+def _packed(root: Path) -> list[Path]:
+    found = {path for pattern in PACKED for path in root.glob(pattern) if path.is_file()}
+    return sorted(path for path in found if not path.name.startswith(".") and "__pycache__" not in path.parts)
+
+
+def _readme(root: Path, wheel: str) -> str:
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return README.format(title=project["description"], python=project["requires-python"], wheel=wheel)
+
+
+def main() -> int:
+    """Make the zip and say where it is."""
+    try:
+        target = make(ROOT, ROOT / TARGET)
+    except (ValueError, OSError) as error:
+        print(f"make_zip: {error}", file=sys.stderr)
+        return 2
+    print(f"{target} ({target.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

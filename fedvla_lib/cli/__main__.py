@@ -1,0 +1,7 @@
+"""``python -m fedvla_lib.cli``: the same as the command `fedvla`."""
+
+import sys
+
+from fedvla_lib.cli.main import main
+
+sys.exit(main())

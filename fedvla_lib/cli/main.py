@@ -1,0 +1,53 @@
+"""Run one command of `fedvla`.
+
+Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130;
+`kill` and a closed terminal count as Ctrl-C.
+"""
+
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from fedvla_lib.cli.commands import FAILED
+from fedvla_lib.cli.parser import build_parser
+
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # by kill, by the terminal
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    options = build_parser().parse_args(argv)
+    try:
+        with _ended_as_by_ctrl_c():
+            return options.handler(options) or 0
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: {options.kept}", file=sys.stderr)
+        return INTERRUPTED
+    except EXPECTED as error:
+        if options.traceback:
+            traceback.print_exc()
+        print(f"fedvla {options.command}: {_one_line(error)}", file=sys.stderr)
+        return FAILED
+
+
+@contextmanager
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Meanwhile a command that is told to end stops what it has started. What is ignored stays so, as under nohup."""
+    on_main_thread = threading.current_thread() is threading.main_thread()  # only there may signals be handled
+    signs = [sign for sign in ENDINGS if on_main_thread and signal.getsignal(sign) is signal.SIG_DFL]
+    for sign in signs:
+        signal.signal(sign, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for sign in signs:
+            signal.signal(sign, signal.SIG_DFL)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,133 @@
+"""A data set's frames, decoded once into memory-mapped arrays.
+
+Decoding a random video frame costs milliseconds, reading a row of an array microseconds, and training visits every
+frame many times. So `open_store` reads and checks a data set once, writes one ``.npy`` per camera into the cache and
+from then on only maps the files. This module does not know the format of a data set, nor what a batch is.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from filelock import FileLock
+from PIL import Image, ImageOps
+from tqdm.auto import tqdm
+
+from fedvla_lib.data.lerobot_reader import Source, locate, read_images, read_source
+from fedvla_lib.files import cache_dir
+from fedvla_lib.robot.spec import JOINT_NAMES
+
+STORE_VERSION = 2  # part of every store's key: raise it when the files of a store change
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStore:
+    """All frames of a data set, episode after episode; row i of every array is the same moment."""
+
+    root: Path  # the data set's folder
+    fps: int  # frames per second
+    states: np.ndarray  # float32 (N, 6): joint positions, LeRobot units
+    actions: np.ndarray  # float32 (N, 6): joint targets, LeRobot units
+    images: dict[str, np.ndarray]  # camera -> uint8 (N, size, size, 3), memory-mapped, read-only
+    episodes: pd.DataFrame  # episode_id, start, end (rows, end excluded), num_frames, instruction, task, lab
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the six columns of `states` and `actions`."""
+        return JOINT_NAMES
+
+    @property
+    def num_frames(self) -> int:
+        """Number of rows."""
+        return len(self.states)
+
+    @cached_property
+    def episode_ends(self) -> np.ndarray:
+        """Row at which the episode of each row ends (excluded), int64 (N,)."""
+        return np.repeat(self.episodes["end"].to_numpy(), self.episodes["num_frames"].to_numpy())
+
+    @cached_property
+    def instructions(self) -> list[str]:
+        """The request in words at each row."""
+        return list(np.repeat(self.episodes["instruction"].to_numpy(dtype=object), self.episodes["num_frames"]))
+
+
+def open_store(
+    source: str | Path, *, image_size: int, cameras: Mapping[str, str] | None = None, progress: bool = True
+) -> FrameStore:
+    """Open a data set, decoding its frames into the cache the first time.
+
+    Args:
+        source: a folder in LeRobotDataset v3.0 format, or a hub id such as ``lerobot/svla_so100_pickplace``.
+        image_size: side of the square images in pixels; others are shrunk or enlarged with their aspect kept, and
+            padded with black.
+        cameras: our camera name -> the data set's, e.g. ``{"front": "wrist"}``; None uses `CAMERA_ALIASES`.
+        progress: show a progress bar while decoding.
+
+    Raises:
+        DataError: the data set cannot be had or is broken.
+    """
+    root = locate(source)
+    key = _fingerprint(root, image_size, cameras)
+    folder = cache_dir() / "frames" / key
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_suffix(".lock")):  # two processes that open the same data decode it once
+            if not folder.is_dir():
+                _build(read_source(root, cameras), image_size, folder, progress)
+    return _load(root, folder)
+
+
+def _build(source: Source, image_size: int, folder: Path, progress: bool) -> None:
+    """Write a store's files beside `folder` and rename them into place when they are complete."""
+    partial = folder.with_suffix(".partial")
+    shutil.rmtree(partial, ignore_errors=True)  # left by a build that was killed
+    partial.mkdir()
+    np.save(partial / "states.npy", source.states)
+    np.save(partial / "actions.npy", source.actions)
+    source.episodes.to_json(partial / "episodes.json", orient="records", indent=1)
+    (partial / "store.json").write_text(json.dumps({"fps": source.info["fps"], "cameras": list(source.cameras)}))
+    total = len(source.states) * len(source.cameras)
+    with tqdm(total=total, desc="decoding frames", unit="frame", disable=not progress, leave=False) as bar:
+        for camera, key in source.cameras.items():
+            shape = (len(source.states), image_size, image_size, 3)
+            out = np.lib.format.open_memmap(partial / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
+            for row, picture in read_images(source, key):
+                out[row] = fit_square(picture, image_size)
+                bar.update()
+            out.flush()
+    os.replace(partial, folder)
+
+
+def _load(root: Path, folder: Path) -> FrameStore:
+    content = json.loads((folder / "store.json").read_text())
+    return FrameStore(
+        root=root,
+        fps=content["fps"],
+        states=np.load(folder / "states.npy"),
+        actions=np.load(folder / "actions.npy"),
+        images={camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in content["cameras"]},
+        episodes=pd.DataFrame(json.loads((folder / "episodes.json").read_text())),
+    )
+
+
+def _fingerprint(root: Path, image_size: int, cameras: Mapping[str, str] | None) -> str:
+    """Name of a store: changes with every file of the data set (name, size, time), the size and the cameras."""
+    paths = sorted(path for part in ("meta", "data", "videos") for path in (root / part).rglob("*") if path.is_file())
+    files = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    content = json.dumps([STORE_VERSION, image_size, dict(cameras or {}), files])
+    return hashlib.sha256(content.encode()).hexdigest()[:24]
+
+
+def fit_square(picture: np.ndarray, size: int) -> np.ndarray:
+    """Return uint8 (H, W, 3) as uint8 (size, size, 3): scaled with its aspect kept, centred on black."""
+    if picture.shape[:2] == (size, size):
+        return picture
+    return np.asarray(ImageOps.pad(Image.fromarray(picture), (size, size), Image.Resampling.BILINEAR))

@@ -1,0 +1,36 @@
+"""The data set of a run: the one its settings name, or a recording made in the cache."""
+
+import hashlib
+import json
+from pathlib import Path
+
+from fedvla_lib.config import Config, task_names
+from fedvla_lib.data import frame_store
+from fedvla_lib.data.record import record
+from fedvla_lib.files import cache_dir
+from fedvla_lib.provenance import code_digest
+
+
+def resolve(config: Config) -> Path | str:
+    """Return the data set of a run: `config.data`, else a recording in the cache, made now if it is not there yet."""
+    if config.data:
+        folder = Path(config.data).expanduser()
+        return folder if folder.exists() else config.data
+    tasks = task_names(config)
+    settings = [tasks, config.image_size, config.episodes_per_task, config.seed, config.num_labs]
+    key = json.dumps([*settings, code_digest(record)])
+    name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
+    root = cache_dir() / "recordings" / name
+    return record(
+        tasks,
+        config.episodes_per_task,
+        root,
+        image_size=config.image_size,
+        seed=config.seed,
+        num_labs=config.num_labs,
+    )
+
+
+def open_frames(config: Config) -> frame_store.FrameStore:
+    """Open the data set that the settings name, recording and decoding it first if need be."""
+    return frame_store.open_store(resolve(config), image_size=config.image_size)

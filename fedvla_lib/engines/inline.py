@@ -1,0 +1,186 @@
+"""Ways to run the one Flower app: here in this process, or on Flower's own runtimes with the same settings.
+
+`run_inline` is for notebooks, tests and breakpoints: a `Grid` of Flower's that calls the ClientApp in this process, one
+client after the other in the order of their partitions. Scale comes from Flower's engines, which run the same apps.
+"""
+
+import copy
+import functools
+import logging
+import time
+import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from flwr.app import Context, Error, Message, RecordDict, UserConfig
+from flwr.clientapp import ClientApp
+from flwr.common.constant import SUPERLINK_NODE_ID, ErrorCode
+from flwr.serverapp import Grid
+from flwr.supercore.run import Run
+from flwr.supercore.task_identity import TaskIdentity
+from tqdm.auto import tqdm
+
+from fedvla_lib.config import Config, check, to_run_config
+from fedvla_lib.federation import client, client_app, server_app
+from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
+from fedvla_lib.policy.parameters import Arrays
+
+logger = logging.getLogger(__name__)
+RUN_ID = 1
+FIRST_NODE_ID = SUPERLINK_NODE_ID + 1
+
+
+def run_inline(
+    config: Config,
+    *,
+    clients_app: ClientApp | None = None,
+    data: Sequence[Path] = (),
+    progress: bool = True,
+    raise_errors: bool = False,
+) -> Path:
+    """Run a federation in this process and return its run folder; the same settings give the same bits.
+
+    Args:
+        clients_app: the ClientApp to call; default this library's, with frames and policy opened once for all clients.
+        data: a data set for each client; without, each takes its part of ``config.data``.
+        progress: show a bar over the clients of each round.
+        raise_errors: let a client's exception surface (for debugging) instead of rejecting its reply.
+
+    Raises:
+        TooFewReplies: a round had fewer good replies than `config.min_replies`; what was written so far stays.
+        ValueError: settings, data or output folder that cannot be used.
+    """
+    tools = cached(client.LOADERS)
+    app = clients_app or client_app.build(tools)
+    run_config = to_run_config(check(config))
+    context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
+    claim_identity()
+    with _quiet_flower():
+        grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
+        server_app.build(tools, engine="inline", progress=progress, states=grid)(grid, context)
+    return Path(context.state["run"]["folder"])
+
+
+def cached(tools: client.Loaders) -> client.Loaders:
+    """Return tools that open the frames and build the policy once and lend them to whoever asks again."""
+    return client.Loaders(functools.cache(tools.open_frames), functools.cache(tools.load_policy))
+
+
+class InlineGrid(Grid):
+    """Flower's grid without a network: a message sent is handled at once, an exception becomes an error reply.
+
+    Args:
+        app: handles the messages of all clients.
+        num_clients: clients there are; client k is node ``FIRST_NODE_ID + k``, with partition-id k and its own context.
+        run_config: settings of the run, as Flower passes them.
+        data: a data set for each client; none: the settings' own.
+    """
+
+    def __init__(
+        self,
+        app: ClientApp,
+        num_clients: int,
+        run_config: UserConfig,
+        data: Sequence[Path] = (),
+        *,
+        progress: bool = False,
+        raise_errors: bool = False,
+    ) -> None:
+        self._app, self._progress, self._raise_errors = app, progress, raise_errors
+        self._run = Run.create_empty(RUN_ID)
+        self._replies: dict[str, Message] = {}
+        self._took_s: dict[str, float] = {}
+        self._contexts = {}
+        for k in range(num_clients):
+            node, node_config = FIRST_NODE_ID + k, {PARTITION: k, "num-partitions": num_clients}
+            if data:
+                node_config[DATA] = str(Path(data[k]).resolve())
+            self._contexts[node] = Context(RUN_ID, node, node_config, RecordDict(), dict(run_config))
+
+    def set_run(self, run: Run) -> None:
+        """Take over the description of the run."""
+        self._run = run
+
+    @property
+    def run(self) -> Run:
+        """Description of the run."""
+        return self._run
+
+    def create_message(
+        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
+    ) -> Message:
+        """Return a message to a node, as Flower's constructor does."""
+        return Message(content, dst_node_id, message_type, ttl=ttl, group_id=group_id)
+
+    def get_node_ids(self) -> list[int]:
+        """Return the node ids in the order of partitions."""
+        return list(self._contexts)
+
+    def push_messages(self, messages: Iterable[Message]) -> list[str]:
+        """Handle each message in the order of nodes, and return one id per message."""
+        ordered = sorted(messages, key=lambda message: message.metadata.dst_node_id)
+        kind = ordered[0].metadata.message_type if ordered else ""
+        bar = tqdm(ordered, desc=f"clients: {kind}", disable=not (self._progress and ordered), leave=False)
+        return [self._handle(message) for message in bar]
+
+    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
+        """Hand out the replies to the given messages, once."""
+        return [self._replies.pop(key) for key in message_ids if key in self._replies]
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
+        """Push and pull, without the replies of clients that took longer than `timeout` seconds.
+
+        Clients take turns here, so each has a clock of its own, as if all had started at once on machines of their own.
+        """
+        sent = self.push_messages(messages)
+        replies = zip(sent, self.pull_messages(sent), strict=True)
+        return [reply for key, reply in replies if timeout is None or self._took_s[key] <= timeout]
+
+    def client_states(self) -> dict[str, Arrays]:
+        """Return the arrays in the clients' contexts, by node and record."""
+        return {
+            f"{node}:{name}": unpack_arrays(record)
+            for node, context in self._contexts.items()
+            for name, record in context.state.array_records.items()
+        }
+
+    def restore_clients(self, states: dict[str, Arrays]) -> None:
+        """Put arrays back into the clients' contexts."""
+        for key, arrays in states.items():
+            node, name = key.split(":", 1)
+            self._contexts[int(node)].state[name] = pack_arrays(arrays)
+
+    def _handle(self, message: Message) -> str:
+        """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""
+        key = str(len(self._took_s))
+        message.metadata.__dict__["_message_id"] = key  # a reply names it; Flower's grids set it this way too
+        node, began = message.metadata.dst_node_id, time.perf_counter()
+        try:
+            self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])
+        except Exception as error:
+            if self._raise_errors:
+                raise
+            logger.debug("client on node %d raised\n%s", node, traceback.format_exc())
+            reason = f"{type(error).__name__}: {error}"
+            failure = Error(code=ErrorCode.CLIENT_APP_RAISED_EXCEPTION, reason=reason)
+            self._replies[key] = Message(failure, reply_to=message)
+        self._took_s[key] = time.perf_counter() - began
+        return key
+
+
+def claim_identity() -> None:
+    """Tell Flower's message class who this process is, as Flower's runtimes do before they start an app."""
+    TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SUPERLINK_NODE_ID, 0
+
+
+@contextmanager
+def _quiet_flower() -> Iterator[None]:
+    """Keep Flower's line per event out of notebooks: the run folder has it all."""
+    flower = logging.getLogger("flwr")
+    before = flower.level
+    flower.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        flower.setLevel(before)

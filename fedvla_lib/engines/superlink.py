@@ -1,0 +1,174 @@
+"""Flower's own programs as this library starts them: a local SuperLink, `flwr run`, and the run's real status.
+
+`run_simulation` runs the app on Flower's simulation runtime; `deploy` adds SuperNodes to a SuperLink from here.
+
+These are the documented commands, wrapped because four of their habits trip a small machine: the SuperLink that
+`flwr run` starts by itself gives up after 15 s, a client asks for two cores, a failed run still exits with 0, and Ray,
+which runs the clients, gives up if its own processes take long to start.
+"""
+
+import json
+import os
+import re
+import ssl
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fedvla_lib.engines.credentials import ServerFiles
+from fedvla_lib.engines.processes import FlowerRunError, _one_line, free_port, program, reason, start, stop, wait_until
+
+STATUS_TRIES, POLL_S = 6, 5.0
+COMPLETED = "finished:completed"
+OFFLINE = {  # Flower and Ray ask the network nothing
+    "FLWR_TELEMETRY_ENABLED": "0",
+    "FLWR_DISABLE_UPDATE_CHECK": "1",
+    "FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION": "1",
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
+CONNECTION = "book"
+
+
+@dataclass(frozen=True)
+class SuperLink:
+    """A SuperLink that is up, and the environment in which `flwr` finds it."""
+
+    environment: dict[str, str]
+    log: Path  # what the run printed
+    port: int = 0
+    files: ServerFiles | None = None  # of a SuperLink with TLS
+    connection: str = CONNECTION  # its name in Flower's file of them
+
+    def submit(self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None) -> str:
+        """Start a run of the app, follow its log until the run ends, and return its id.
+
+        Following costs nothing, while each further `flwr` command costs seconds of computing time. Meanwhile `watch` is
+        called every second.
+
+        Raises:
+            FlowerRunError: the run was not accepted, or did not end in time.
+        """
+        command = [program("flwr"), "run", str(app), self.connection, *options, "--stream"]
+        with open(self.log, "wb") as log:
+            process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
+            try:
+                _follow(process, timeout_s, watch)
+            except subprocess.TimeoutExpired as error:
+                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {reason(self.log)}") from error
+            finally:
+                process.kill()
+        accepted = re.search(r"Successfully started run (\d+)", self.log.read_text(errors="replace"))
+        if not accepted:
+            raise FlowerRunError(f"flwr run failed: {reason(self.log)}")
+        return accepted[1]
+
+    def status(self, run_id: str) -> tuple[str, str]:
+        """Return a run's status, such as ``running`` or ``finished:completed``, and its details."""
+        answer = self.ask("list", self.connection, "--run-id", run_id)
+        if not answer.get("runs"):
+            raise FlowerRunError(f"flwr list knows no run {run_id}")
+        return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
+
+    def ask(self, *command: str) -> dict[str, Any]:
+        """Return the JSON that a `flwr` command answers.
+
+        Raises:
+            FlowerRunError: the command failed.
+        """
+        whole = [program("flwr"), *command, "--format", "json"]
+        done = subprocess.run(whole, env=self.environment, capture_output=True, text=True)
+        if "{\n" not in done.stdout:
+            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(done.stderr or done.stdout)}")
+        answer = json.loads(done.stdout[done.stdout.find("{\n") :])
+        if not answer.get("success", True):
+            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(answer.get('error-message', done.stdout))}")
+        return answer
+
+
+@contextmanager
+def local_superlink(home: Path, *options: str, files: ServerFiles | None = None) -> Iterator[SuperLink]:
+    """Start a SuperLink on a free port of this machine, with `home` as FLWR_HOME, and stop it at the end.
+
+    Args:
+        options: for ``flower-superlink``, such as ``--simulation``.
+        files: certificates; without them the connection is not encrypted.
+
+    Raises:
+        FlowerRunError: it did not answer within two minutes.
+    """
+    port = free_port()
+    environment = flower_environment(home)
+    secure = f"root-certificates = {json.dumps(str(files.authority))}" if files else "insecure = true"
+    connection = f'[superlink.{CONNECTION}]\naddress = "127.0.0.1:{port}"\n{secure}\n'
+    (home / "config.toml").write_text(f'[superlink]\ndefault = "{CONNECTION}"\n\n{connection}')
+    protection = ["--insecure"]
+    if files:
+        protection = ["--ssl-ca-certfile", str(files.authority), "--ssl-certfile", str(files.certificate)]
+        protection += ["--ssl-keyfile", str(files.key)]
+    command = ["flower-superlink", *protection, *options, "--host", "127.0.0.1", "--port", str(port)]
+    process = start(command, environment, log := home / "superlink.log")
+    try:
+        wait_until(lambda: answers(port, files), process, log, "the SuperLink")
+        yield SuperLink(environment, home / "run.log", port, files)
+    finally:
+        stop(process)
+
+
+def flower_environment(home: Path) -> dict[str, str]:
+    """Return the environment of Flower's programs: their files in `home`, no network but what they are told.
+
+    Notebooks ask every program for colours, which would stand inside the JSON that `ask` reads.
+    """
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
+    plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "CLICOLOR_FORCE")}
+    return {**plain, **OFFLINE, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
+
+
+def require_completed(link: SuperLink, run_id: str) -> None:
+    """Ask how a run ended: `flwr run` exits with 0 for failed runs too, and the status may lag behind the log's end.
+
+    Raises:
+        FlowerRunError: it did not complete.
+    """
+    status, details = last_status(link, run_id)
+    if status != COMPLETED:
+        raise FlowerRunError(f"run {run_id} is {status} ({details}); {reason(link.log)}")
+
+
+def last_status(link: SuperLink, run_id: str) -> tuple[str, str]:
+    """Return status and details of a run whose log has ended, once they say so, or after half a minute."""
+    for _ in range(STATUS_TRIES):
+        status, details = link.status(run_id)
+        if status.startswith("finished"):
+            break
+        time.sleep(POLL_S)
+    return status, details
+
+
+def answers(port: int, files: ServerFiles | None = None) -> bool:
+    """Whether a SuperLink on this machine says that it is well."""
+    scheme, trust = ("https", ssl.create_default_context(cafile=files.authority)) if files else ("http", None)
+    try:
+        with urllib.request.urlopen(f"{scheme}://127.0.0.1:{port}/health", timeout=2, context=trust) as response:
+            return response.status == 200
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+def _follow(process: subprocess.Popen, timeout_s: float, watch: Callable[[], None]) -> None:
+    """Wait for a process, calling `watch` every second and once at the end."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            process.wait(min(1.0, max(0.0, deadline - time.monotonic())))
+            return watch()
+        except subprocess.TimeoutExpired:
+            watch()
+            if time.monotonic() > deadline:
+                raise

@@ -1,0 +1,76 @@
+"""Rollouts as mp4 videos with their trajectories, and videos read back."""
+
+import io
+import os
+import tempfile
+from datetime import datetime
+from pathlib import Path
+
+import av
+import numpy as np
+
+from fedvla_lib.robot.rollout import Episode
+from fedvla_lib.robot.spec import CAMERAS, FPS
+
+VIDEO_SCALE = 2  # whole pixels are doubled: 96 px cameras are small on a page
+
+
+def save_rollout(episode: Episode, folder: Path) -> Path:
+    """Write video and trajectory of a rollout and return the video's path; existing files are never overwritten."""
+    stamp = datetime.now().strftime("%Y%m%d_%H%M%S_%f")
+    path = folder / f"rollout_{stamp}_{episode.task}_{episode.seed}.mp4"
+    _write(path, encode_video(side_by_side(episode)))
+    trajectory = io.BytesIO()
+    np.savez(trajectory, states=episode.states, actions=episode.actions, success=episode.success, seed=episode.seed)
+    _write(path.with_suffix(".npz"), trajectory.getvalue())
+    return path
+
+
+def side_by_side(episode: Episode) -> np.ndarray:
+    """Put the cameras next to each other, enlarged: uint8 (T, H, W, 3)."""
+    frames = np.concatenate([episode.images[camera] for camera in CAMERAS], axis=2)
+    return frames.repeat(VIDEO_SCALE, axis=1).repeat(VIDEO_SCALE, axis=2)
+
+
+def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
+    """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first.
+
+    Raises:
+        ValueError: frames of another shape or type, none at all, or odd sides (yuv420p halves them).
+    """
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
+        raise ValueError(f"frames are {frames.dtype} {frames.shape}: give uint8 (T, H, W, 3) with T > 0")
+    height, width = frames.shape[1:3]
+    if height % 2 or width % 2:
+        raise ValueError(f"frames are {width} x {height} pixels: give even sides")
+    with tempfile.TemporaryDirectory() as scratch:  # moving the index to the front needs a real file
+        path = Path(scratch) / "video.mp4"
+        with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+            quality = {"crf": "20", "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
+            stream = container.add_stream("libx264", rate=fps, options=quality)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            for pixels in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            container.mux(stream.encode(None))
+        return path.read_bytes()
+
+
+def read_video(path: Path) -> np.ndarray:
+    """Decode an mp4 whole: uint8 (T, H, W, 3).
+
+    Raises:
+        ValueError: the file is no readable video; the message names it.
+    """
+    av.logging.set_level(None)  # LeRobot's encoder leaves libav printing to stderr; the exception says what is wrong
+    try:
+        with av.open(str(path)) as container:
+            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    except (av.FFmpegError, ValueError, OSError, IndexError) as error:  # IndexError: no stream of pictures
+        raise ValueError(f"{path} is not a readable video: {error}") from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.part")
+    scratch.write_bytes(content)
+    os.replace(scratch, path)

@@ -1,0 +1,106 @@
+"""A folder of rollout videos -> what the trajectories beside them say, round by round; damaged files are listed."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import pandas as pd
+
+from fedvla_lib import files
+from fedvla_lib.evaluation import figures, rollouts, statistics
+from fedvla_lib.evaluation.video import read_video
+from fedvla_lib.robot.spec import FPS
+
+METRICS = {
+    "success_rate": "success rate",
+    "completion_time": "completion time of successes [s]",
+    "action_smoothness": "action smoothness [deg per step²]",
+}
+
+
+def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
+    """Read every ``round_N/WHO/rollout_*.mp4`` under `folder` with its trajectory, and check one against the other.
+
+    Returns:
+        A row for each sound rollout (round, who, task, seed, success, steps, completion_time, action_smoothness), and
+        a line for each damaged one: which file, and what is wrong.
+
+    Raises:
+        ValueError: there is no such video.
+    """
+    folder = Path(folder)
+    videos = sorted({path.with_suffix(".mp4") for path in folder.glob("round_*/*/rollout_*.*")})
+    if not videos:
+        raise ValueError(f"{folder} holds no round_N/WHO/rollout_*.mp4: give the evaluate folder of a run")
+    rows, damaged = [], []
+    for video in videos:
+        try:
+            rows.append(_read(video))
+        except ValueError as error:
+            damaged.append(f"{video.relative_to(folder)}: {error}")
+    return pd.DataFrame(rows), damaged
+
+
+def _read(video: Path) -> dict[str, Any]:
+    if not video.is_file():
+        raise ValueError("the trajectory has no video")
+    kept = _trajectory(video.with_suffix(".npz"))
+    frames, steps = len(read_video(video)), len(kept["actions"])
+    if frames != steps:
+        raise ValueError(f"the video has {frames} frames, its trajectory {steps} steps")
+    success = bool(kept["success"])
+    return {
+        "round": int(video.parts[-3].removeprefix("round_")), "who": video.parts[-2],
+        "task": video.stem.rsplit("_", 2)[1], "seed": int(kept["seed"]), "success": success, "steps": steps,
+        "completion_time": steps / FPS if success else float("nan"),
+        "action_smoothness": rollouts.smoothness(kept["actions"]),
+    }  # fmt: skip
+
+
+def _trajectory(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise ValueError("no trajectory lies beside it")
+    try:
+        with np.load(path) as kept:
+            return {name: kept[name] for name in ("actions", "success", "seed")}
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+        raise ValueError(f"its trajectory cannot be read: {error}") from error
+
+
+def check_metrics(metrics: Sequence[str]) -> list[str]:
+    """Return the metrics.
+
+    Raises:
+        ValueError: one of them is unknown.
+    """
+    for metric in metrics:
+        if metric not in METRICS:
+            raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(METRICS)}")
+    return list(metrics)
+
+
+def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.DataFrame:
+    """Return a metric for each round: n, value, low, high (Wilson for success, else bootstrap over rollouts)."""
+    lines = []
+    for number, part in rows.groupby("round"):
+        each = part["success" if metric == "success_rate" else metric].dropna().to_numpy(float)
+        low, high = float("nan"), float("nan")
+        if metric == "success_rate":
+            low, high = statistics.wilson(int(each.sum()), len(each))
+        elif len(each):
+            low, high = statistics.mean_interval(each, seed=seed)
+        value = float(each.mean()) if len(each) else float("nan")
+        lines.append({"round": number, "metric": metric, "n": len(each), "value": value, "low": low, "high": high})
+    return pd.DataFrame(lines)
+
+
+def write(out: Path, rows: pd.DataFrame, table: pd.DataFrame, damaged: Sequence[str]) -> None:
+    """Write every rollout and every round as CSV, damaged files as JSON, and a figure of the trend into `out`."""
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    files.write_atomically(out / "rollouts.csv", rows.to_csv(index=False).encode())
+    files.write_atomically(out / "rounds.csv", table.to_csv(index=False).encode())
+    files.write_json(out / "damaged.json", list(damaged))
+    figures.save(figures.trends(table, METRICS), out / "trend.png")

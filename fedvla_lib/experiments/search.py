@@ -1,0 +1,185 @@
+"""Search for settings across clients at a fixed budget of gradient steps, with Optuna.
+
+Every trial spends the same steps. Settings are chosen by the held-out loss on one half of the validation episodes; what
+is reported of the winner, and of the settings that the search started from, comes from the other half and from rollouts
+that no trial has seen.
+"""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import optuna
+import pandas as pd
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from fedvla_lib import provenance
+from fedvla_lib.config import STRATEGIES, Config, check
+from fedvla_lib.data import recordings, splits
+from fedvla_lib.evaluation import measure
+from fedvla_lib.evaluation.rollouts import roll_out, rollout_seeds
+from fedvla_lib.evaluation.statistics import wilson
+from fedvla_lib.experiments import methods
+from fedvla_lib.experiments.experiment import with_recording
+from fedvla_lib.experiments.plan import QUIET
+from fedvla_lib.federation.nodes import TooFewReplies, draw_size
+from fedvla_lib.federation.strategies.build import SERVER_LR
+from fedvla_lib.files import write_json
+from fedvla_lib.policy.model import Bundle
+
+# Not those of chapters; of the stored experiments comparison.toml and normalisation.toml have the same. Trials make no
+# attempts, so none has chosen by them.
+ROLLOUTS_FROM = 3_000_000
+LOCAL_STEPS = (1, 2, 5, 10, 20)
+# A client whose loss is not finite raises, and the server gives up when too few replies can be used.
+DIVERGED = (FloatingPointError, TooFewReplies)
+SHARES = (0.1, 0.2, 0.4, 1.0)
+SEARCHED = ("lr", "local_steps", "fraction_train", "server_lr", "proximal_mu")
+COMPARED = (
+    "strategy", "settings", "trials", "diverged", *SEARCHED, "selection_loss", "loss", "n", "successes",
+    "success_rate", "low", "high",
+)  # fmt: skip
+
+
+def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, Any]:
+    """Try `trials` settings, measure the best and the given ones, and return and write what was found.
+
+    Args:
+        config: where the search starts; its total of gradient steps is the budget of each trial.
+        trials: how many settings to try, those of earlier calls with the same `out` included.
+        rollouts: attempts at each task when the winner is measured.
+        out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
+
+    A trial that diverges counts as one of them, with no loss.
+
+    Raises:
+        ValueError: fewer than one trial or two validation episodes, `out` holds a search with other settings, or every
+            trial diverged.
+    """
+    if trials < 1:
+        raise ValueError(f"trials={trials} is not usable: give a number above 0")
+    given = replace(config, **QUIET, validate_every=10**6)
+    config, out = with_recording(given), Path(out)
+    if (count := len(splits.held_out_episodes(recordings.open_frames(config), config))) < 2:
+        raise ValueError(
+            f"val-fraction={config.val_fraction} leaves {count} validation episodes: a search needs 2 or more, half to "
+            "choose by and half to report on"
+        )
+    study = _open(config, out)
+    todo = trials - len(study.get_trials(states=[TrialState.COMPLETE, TrialState.FAIL]))
+    study.optimize(
+        lambda trial: _selection_loss(suggest(trial, config)),
+        n_trials=max(0, todo), show_progress_bar=True, catch=DIVERGED,
+    )  # fmt: skip
+    if not study.get_trials(states=[TrialState.COMPLETE]):
+        raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
+    ended = {"status": "completed", "code": methods.trained_by()}
+    found = {
+        "budget": methods.total_steps(config),
+        "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],
+        "winner": study.best_params, "selection_loss": study.best_value,
+        "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
+        "first_rollout_seed": ROLLOUTS_FROM, "config": asdict(given),
+        "stamp": provenance.first_stamp(given, "search") | ended,
+    }  # fmt: skip
+    write_json(out / "search.json", found)
+    return found
+
+
+def suggest(trial: Any, config: Config) -> Config:
+    """Return the settings of a trial: rate, local steps, clients a round, and what the strategy has to be told."""
+    local_steps = trial.suggest_categorical("local_steps", LOCAL_STEPS)
+    share = trial.suggest_categorical("fraction_train", SHARES)
+    rate = trial.suggest_float("lr", 2e-4, 5e-3, log=True)
+    chosen = {"lr": rate, "local_steps": local_steps, "fraction_train": share}
+    if config.strategy in ("fedavgm", "fedadam", "fedyogi"):
+        chosen["server_lr"] = trial.suggest_float("server_lr", 1e-3, 2.0, log=True)
+    if config.strategy == "fedprox":
+        chosen["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
+    a_round = local_steps * draw_size(share, config.num_clients)
+    return check(replace(config, **chosen, num_server_rounds=max(1, methods.total_steps(config) // a_round)))
+
+
+def report(config: Config, rollouts: int) -> dict[str, Any]:
+    """Measure settings on what did not choose them: the other validation episodes, and rollouts."""
+    bundle = methods.federated_policy(config)
+    rows = roll_out(bundle, config, rollout_seeds(rollouts, first=ROLLOUTS_FROM))
+    return {
+        "loss": _loss(bundle, config, 1), "gradient_steps": methods.total_steps(config),
+        "n": len(rows), "successes": sum(row["success"] for row in rows),
+    }  # fmt: skip
+
+
+def read_searches(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what each search in a folder of its own below `folder` has found, by strategy.
+
+    Raises:
+        ValueError: there is none, or two are of one strategy.
+    """
+    files = sorted(Path(folder).glob("*/search.json"))
+    found = {one["config"]["strategy"]: one for one in (json.loads(file.read_text(encoding="utf-8")) for file in files)}
+    if not files or len(found) < len(files):
+        raise ValueError(f"{folder} has {len(files)} searches of {len(found)} strategies: one of each is read")
+    return {name: found[name] for name in STRATEGIES if name in found}
+
+
+def compared(searches: dict[str, dict[str, Any]]) -> pd.DataFrame:
+    """Return two lines for each of `searches`: the settings that it started from, and its winner.
+
+    Columns: strategy, settings ("start" or "winner"); trials, and how many of them diverged; what was searched for, NaN
+    where a strategy has no such setting; selection_loss, NaN for the start, which is no trial; loss, on the episodes
+    that chose nothing; n, successes, success_rate, low, high (Wilson interval).
+    """
+    lines = []
+    for name, found in searches.items():
+        diverged = sum(trial["selection_loss"] is None for trial in found["trials"])
+        line = {"strategy": name, "trials": len(found["trials"]), "diverged": diverged}
+        winner = found["winner"] | {"selection_loss": found["selection_loss"]}
+        lines.append({**line, "settings": "start", **_started_from(found), **_measured(found["start"])})
+        lines.append({**line, "settings": "winner", **winner, **_measured(found["best"])})
+    return pd.DataFrame(lines, columns=COMPARED)
+
+
+def _started_from(found: dict[str, Any]) -> dict[str, Any]:
+    """The given value of each setting that was searched for; a server-lr of 0 stands for the strategy's own."""
+    given = {name: found["config"][name] for name in found["winner"]}
+    if "server_lr" in given:
+        given["server_lr"] = given["server_lr"] or SERVER_LR[found["config"]["strategy"]]
+    return given
+
+
+def _measured(one: dict[str, Any]) -> dict[str, Any]:
+    low, high = wilson(one["successes"], one["n"])
+    rate = {"success_rate": one["successes"] / one["n"], "low": low, "high": high}
+    return {"loss": one["loss"], "n": one["n"], "successes": one["successes"], **rate}
+
+
+def _selection_loss(config: Config) -> float:
+    return _loss(methods.federated_policy(config), config, 0)
+
+
+def _loss(bundle: Bundle, config: Config, half: int) -> float:
+    """Held-out loss on every second validation episode, from the first or from the second on."""
+    store = recordings.open_frames(config)
+    episodes = splits.held_out_episodes(store, config)[half::2]
+    return measure.measure_held_out(bundle, store, episodes, config)[1]["loss"]
+
+
+def _open(config: Config, out: Path) -> optuna.Study:
+    out.mkdir(parents=True, exist_ok=True)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = JournalStorage(JournalFileBackend(str(out / "trials.log")))
+    study = optuna.create_study(storage=storage, study_name="search", load_if_exists=True)
+    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))  # not the same draws again
+    wanted = json.dumps(asdict(replace(config, data="", num_threads=0)))
+    if study.user_attrs.get("settings", wanted) != wanted:
+        raise ValueError(f"{out} holds a search with other settings: give another folder")
+    study.set_user_attr("settings", wanted)
+    return study
+
+
+def _line(trial: Any) -> dict[str, Any]:
+    return {"number": trial.number, **trial.params, "selection_loss": trial.value}

@@ -1,0 +1,108 @@
+"""What a federation needs to go on after the server died: arrays, the strategy's memory and the clients', each round.
+
+::
+
+    <run folder>/checkpoints/round_3/
+      arrays.safetensors          the global arrays, unrounded
+      strategy.safetensors        momentum, second moments or control variates, as far as the strategy has any
+      clients.safetensors         what clients keep from round to round, where the engine can give it
+
+Each file carries the SHA-256 of its arrays: safetensors itself notices a file that was cut off, but no flipped bit.
+"""
+
+import logging
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from fedvla_lib.files import safetensors_errors_named
+from fedvla_lib.policy.parameters import Arrays, ParameterError, check_digest, digest
+
+logger = logging.getLogger(__name__)
+KEPT = 2  # rounds: the last, and one before it should the disk have failed under the last
+HASH = "sha256"  # in the header of a file
+PARTS = ("arrays", "strategy", "clients")
+NAME = re.compile(r"round_(\d+)")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A run at the end of a round; arrays by name, the strategy's and clients' names with a path before them."""
+
+    round: int
+    arrays: Arrays
+    strategy: Arrays
+    clients: Arrays
+
+
+def save(root: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint into the run folder, whole or not at all, and remove those before the last two.
+
+    Raises:
+        OSError: it cannot be written; the message names the file.
+    """
+    folder = root / "checkpoints" / f"round_{checkpoint.round}"
+    scratch = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(scratch, ignore_errors=True)
+    try:
+        scratch.mkdir(parents=True)
+        for part in PARTS:
+            with safetensors_errors_named(folder / f"{part}.safetensors"):
+                arrays = getattr(checkpoint, part)
+                save_file(arrays, scratch / f"{part}.safetensors", metadata={HASH: digest(arrays)})
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(scratch, folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    for old in sorted(_rounds(root))[:-KEPT]:
+        shutil.rmtree(root / "checkpoints" / f"round_{old}")
+
+
+def load(root: Path) -> Checkpoint:
+    """Return the last checkpoint of a run folder that is whole, and warn of a later one that is damaged.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if not (rounds := sorted(_rounds(root), reverse=True)):
+        raise ValueError(f"{root} has no checkpoint: no round of it was completed, so start it anew")
+    for number in rounds:
+        folder = root / "checkpoints" / f"round_{number}"
+        try:
+            return Checkpoint(number, **{part: _read(folder / f"{part}.safetensors") for part in PARTS})
+        except (SafetensorError, OSError, ParameterError) as error:
+            damage = f"{folder} is damaged ({error})"
+            logger.warning("%s: looking for the round before", damage)
+    raise ValueError(f"{damage}, and no checkpoint before it is whole: start the run anew")
+
+
+def _read(file: Path) -> Arrays:
+    with safe_open(file, framework="numpy") as content:
+        arrays = {name: content.get_tensor(name) for name in content.keys()}
+        check_digest(arrays, (content.metadata() or {}).get(HASH, ""))
+    return arrays
+
+
+def flat(tree: Mapping[str, Arrays]) -> Arrays:
+    """Return one mapping of arrays for several, the outer name before a slash."""
+    return {f"{outer}/{name}": array for outer, arrays in tree.items() for name, array in arrays.items()}
+
+
+def nested(arrays: Arrays) -> dict[str, Arrays]:
+    """Undo `flat`."""
+    tree: dict[str, Arrays] = {}
+    for path, array in arrays.items():
+        outer, name = path.split("/", 1)
+        tree.setdefault(outer, {})[name] = array
+    return tree
+
+
+def _rounds(root: Path) -> list[int]:
+    found = [NAME.fullmatch(path.name) for path in (root / "checkpoints").glob("round_*")]
+    return [int(match[1]) for match in found if match]

@@ -1,0 +1,156 @@
+"""What a client holds and what it does in a round, without Flower: `client_app` is a thin shell around this module.
+
+Data set, split and partition follow from the run's settings, so all clients agree on them without talking; each then
+touches only the episodes of its own part.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fedvla_lib.config import Config
+from fedvla_lib.data import frame_store, normalisation, splits
+from fedvla_lib.data.batches import Batches
+from fedvla_lib.data.normalisation import unpack_stats
+from fedvla_lib.data.recordings import open_frames
+from fedvla_lib.data.splits import Share, labs_of, num_frames, shares, tasks_of
+from fedvla_lib.evaluation.measure import measure_held_out
+from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
+from fedvla_lib.policy import model, prefix_cache, training
+from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.parameters import Arrays
+from fedvla_lib.policy.training import Correction
+
+CLIENT_SEEDS = 1_000  # rollout seeds set aside for each client
+
+
+@dataclass(frozen=True)
+class Loaders:
+    """How frames are opened and a policy is built. The inline engine passes functions that remember their result.
+
+    Lending one policy to several clients is safe: each overwrites all trainable arrays and nothing else ever changes.
+    """
+
+    open_frames: Callable[[Config], frame_store.FrameStore]
+    load_policy: Callable[[Config, str], model.Bundle]  # settings, statistics as JSON text
+
+
+def load_policy(config: Config, stats_text: str) -> model.Bundle:
+    """Build the policy that normalises with the given statistics."""
+    return model.load_policy(config, unpack_stats(stats_text))
+
+
+LOADERS = Loaders(open_frames, load_policy)
+
+
+@dataclass(frozen=True)
+class Client:
+    """Client `partition_id` of a run."""
+
+    config: Config
+    partition_id: int
+    store: frame_store.FrameStore
+    share: Share
+
+    @property
+    def num_examples(self) -> int:
+        """Training frames: the client's weight."""
+        return num_frames(self.store, self.share.train_ids)
+
+    def statistics(self) -> normalisation.Stats:
+        """Mean, standard deviation, range and count of state and action over the client's training episodes."""
+        return normalisation.episode_stats(self.store, self.share.train_ids)
+
+    def train(
+        self,
+        bundle: model.Bundle,
+        round_number: int,
+        correction: Correction | None = None,
+        moments: Arrays | None = None,
+    ) -> training.TrainResult:
+        """Train for one round; data order and learning rate go on where the round before stopped.
+
+        Args:
+            correction: what the strategy adds to gradients.
+            moments: the optimiser's state after this client's last round; None starts each round afresh.
+        """
+        config = self.config
+        return training.local_train(
+            bundle,
+            prefix_cache.with_cached_prefixes(bundle, self.batches()),
+            config,
+            steps=config.local_steps,
+            start_step=(round_number - 1) * config.local_steps,
+            total_steps=config.num_server_rounds * config.local_steps,
+            progress=False,
+            correction=correction,
+            moments=moments,
+        )
+
+    def batches(self) -> Batches:
+        """Training batches; each client has its own random stream."""
+        config, seed = self.config, client_seed(self.config.seed, self.partition_id)
+        return Batches(
+            self.store, self.share.train_ids, config.chunk_size, config.batch_size, seed=seed, augment=config.augment
+        )
+
+    def validate(self, bundle: model.Bundle) -> tuple[int, dict[str, float]]:
+        """Return the held-out frames measured and the measurements; 0 and none without held-out episodes."""
+        return measure_held_out(bundle, self.store, self.share.val_ids, self.config)
+
+    def roll_out(self, bundle: model.Bundle, videos_dir: Path) -> list[dict[str, Any]]:
+        """Let the policy act on the tasks that the client holds, in turn; videos go to `videos_dir`.
+
+        Seeds and the first task differ from client to client, else all would film the same scene.
+        """
+        held = tasks_of(self.store, self.share.train_ids)
+        own = labs_of(self.store, self.share.train_ids, self.config)
+        seeds = rollout_seeds(self.config.client_rollouts, FIRST_SEED + CLIENT_SEEDS * (self.partition_id + 1))
+        actor = PolicyActor(bundle, self.config.seed)
+        rows = []
+        for turn, seed in enumerate(seeds if held else []):
+            task = held[(self.partition_id + turn) % len(held)]
+            where = own[turn % len(own)]
+            rows += evaluate(
+                actor, [task], [seed], image_size=self.config.image_size, labs=[where], videos_dir=videos_dir,
+                progress=False,
+            )  # fmt: skip
+        return rows
+
+
+def open_client(config: Config, partition_id: int, tools: Loaders = LOADERS, own_data: str = "") -> Client:
+    """Return client `partition_id` with its episodes: a part of the run's data set, or all of one that is its own.
+
+    Args:
+        own_data: the client's own data set, a folder or hub id; without one it takes its part of ``config.data``.
+
+    Raises:
+        ValueError: there is no such partition; the message says what to change.
+    """
+    if not 0 <= partition_id < config.num_clients:
+        raise ValueError(
+            f"partition-id={partition_id} is not one of num-clients={config.num_clients} partitions (0 to "
+            f"{config.num_clients - 1}): start as many SuperNodes as num-clients says"
+        )
+    if own_data:
+        config = replace(config, data=own_data)
+        store = tools.open_frames(config)
+        return Client(config, partition_id, store, Share(*splits.split(store, config.val_fraction, config.seed)))
+    store = tools.open_frames(config)
+    return Client(config, partition_id, store, shares(store, config)[partition_id])
+
+
+def client_seed(seed: int, partition_id: int) -> int:
+    """Return the seed of a client's own random stream; streams of different clients and runs do not overlap."""
+    return int(np.random.SeedSequence([seed, partition_id]).generate_state(1)[0])
+
+
+def kept_between_rounds(config: Config) -> dict[str, bool]:
+    """Whether clients keep something from round to round, by the setting that makes them."""
+    return {
+        f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
+        f"exchange={config.exchange}": config.exchange != "float32", "personal": bool(config.personal),
+    }  # fmt: skip

@@ -1,0 +1,177 @@
+"""What travels between server and clients: the names of Flower's records, and the conversions on either side.
+
+Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
+Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
+SCAFFOLD adds ``control`` both ways: control variates, checked as the arrays are.
+"""
+
+import io
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
+from flwr.common.serde import recorddict_to_proto
+
+from fedvla_lib.federation.quantisation import check_encoded, decode
+from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest
+from fedvla_lib.robot.spec import JOINT_NAMES
+
+ARRAYS = "arrays"
+CONTROL = "control"
+CONFIG = "config"
+METRICS = "metrics"
+NOTE = "note"
+
+ROUND = "server-round"  # Flower's own key
+EXAMPLES = "num-examples"  # training frames: the weight of a client
+STEPS = "steps"  # gradient steps that a client counted while it trained
+DIGEST = "sha256"  # of the arrays
+CONTROL_DIGEST = "sha256-control"
+PROXIMAL_MU = "proximal-mu"  # Flower's own key
+DATA = "data"  # in a node's config: the data set that is this client's own
+PARTITION = "partition-id"  # Flower's own key in a node's config
+STATS = "stats"
+ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # no longer than file systems take
+NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+# The numbers of a reply, all of them and no others: Flower averages records with equal keys only.
+TRAIN_METRICS = (EXAMPLES, STEPS, "loss", "seconds")
+EVALUATE_METRICS = (EXAMPLES, "loss", "action_error", "action_accuracy", *(f"action_error.{j}" for j in JOINT_NAMES))
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
+    """Return named arrays as Flower's record."""
+    return ArrayRecord({name: Array(np.asarray(array)) for name, array in arrays.items()})
+
+
+def unpack_arrays(record: ArrayRecord) -> Arrays:
+    """Return the arrays of a record by name.
+
+    Raises:
+        ParameterError: the bytes of an array cannot be decoded.
+    """
+    return {name: _decode(name, array) for name, array in record.items()}
+
+
+def checked_arrays(
+    content: RecordDict,
+    digest_in: str,
+    shapes: Shapes,
+    record: str = ARRAYS,
+    also: tuple[str, ...] = (),
+    exchange: str = "float32",
+) -> Arrays:
+    """Unpack `record` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
+
+    Args:
+        also: other records of arrays that may be there; more than these is an error.
+        exchange: how the arrays were encoded; they come back as float32.
+
+    Raises:
+        ParameterError: what is wrong, in one line.
+    """
+    key = {ARRAYS: DIGEST, CONTROL: CONTROL_DIGEST}[record]
+    announced = content.config_records.get(digest_in, {}).get(key)
+    if record not in content.array_records or set(content.array_records) - {record, *also}:
+        found = list(content.array_records)
+        raise ParameterError("names", f"expected one record {record!r} of arrays, got {found}")
+    if not isinstance(announced, str):
+        raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{key}")
+    arrays = unpack_arrays(content.array_records[record])
+    if exchange == "float32":
+        check_arrays(arrays, shapes, announced)
+        return arrays
+    check_encoded(arrays, shapes, exchange)
+    check_digest(arrays, announced)
+    return decode(arrays, exchange)
+
+
+def count_bytes(content: RecordDict) -> int:
+    """Return the bytes of a message's records: arrays as Flower counts them, all else as it is serialised.
+
+    (`ConfigRecord.count_bytes` fails on an empty list or text.)
+    """
+    rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
+    return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """What a client's closed-loop evaluation sends back."""
+
+    rows: list[dict[str, Any]]  # a row per rollout, as `evaluate.evaluate` makes them; video is a file name
+    files: dict[str, bytes]  # videos (mp4) and trajectories (npz) by file name
+
+
+def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
+    """Return rows and the files of `folder` as a note: bytes reach the server whatever the engine."""
+    files = sorted(folder.iterdir())
+    named = [{**row, "video": Path(row["video"]).name} for row in rows]
+    return make_note(
+        rollouts=json.dumps(named), file_names=[f.name for f in files], files=[f.read_bytes() for f in files]
+    )
+
+
+def unpack_rollouts(content: RecordDict) -> Rollouts:
+    """Return the rollouts of an evaluation reply.
+
+    Raises:
+        ParameterError: they cannot be read, or a file name is not that of a rollout: a client must not choose where the
+            server writes.
+    """
+    answer = content.config_records.get(NOTE, {})
+    try:
+        rows = json.loads(answer["rollouts"])
+        files = dict(zip(answer["file-names"], answer["files"], strict=True))
+        flat = not any(isinstance(value, dict | list) for row in rows for value in row.values())
+        usable = flat and all(row["video"] in files for row in rows)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise ParameterError("rollouts", f"rollouts cannot be read: {error!r}") from error
+    bad = [
+        name for name, file in files.items()
+        if not isinstance(name, str) or not ROLLOUT_NAME.fullmatch(name) or not isinstance(file, bytes)
+    ]  # fmt: skip
+    if bad or not usable:
+        raise ParameterError("rollouts", f"expected files rollout_<timestamp>....mp4 or .npz, got {sorted(files)}")
+    return Rollouts(rows, files)
+
+
+def make_note(**values: Any) -> ConfigRecord:
+    """Return the client's note: keywords with dashes for underscores."""
+    return ConfigRecord({key.replace("_", "-"): value for key, value in values.items()})
+
+
+def _decode(name: str, array: Array) -> np.ndarray:
+    """Return one array of a record, once its bytes are known to be a .npy of numbers and as long as they claim."""
+    try:
+        _check_npy(name, array)
+        return array.numpy()
+    except ParameterError:
+        raise
+    # NumPy hands a header to Python's parser, which fails in a dozen ways; each is the client's, none may end the run.
+    except Exception as error:
+        raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
+
+
+def _check_npy(name: str, array: Array) -> None:
+    """Compare the header with what was declared and with the bytes there are, before anything is allocated.
+
+    NumPy alone would open an archive, or set memory aside for as many numbers as the header claims.
+    """
+    file = io.BytesIO(array.data)
+    version = np.lib.format.read_magic(file)
+    if version not in NPY_HEADERS:
+        raise ValueError(f".npy version {version}, expected one of {sorted(NPY_HEADERS)}")
+    shape, _, dtype = NPY_HEADERS[version](file)
+    if dtype.kind not in "biufc" or str(dtype) != array.dtype:
+        raise ParameterError("dtype", f"array {name!r} holds {dtype}, expected numbers, as declared {array.dtype!r}")
+    if shape != tuple(array.shape):
+        raise ParameterError("shape", f"array {name!r} has shape {shape}, declared was {tuple(array.shape)}")
+    if (wanted := math.prod(shape) * dtype.itemsize) != (found := len(array.data) - file.tell()):
+        raise ParameterError("shape", f"array {name!r} of shape {shape} takes {wanted} bytes, {found} came")

@@ -1,0 +1,177 @@
+"""Who takes part: Flower's nodes have random ids, ours hold partitions, and one question per run tells which."""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from flwr.app import Message, MessageType, RecordDict
+from flwr.serverapp import Grid
+
+from fedvla_lib.data.normalisation import Stats, unpack_stats
+from fedvla_lib.federation.messages import NOTE
+from fedvla_lib.policy.parameters import ParameterError
+from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
+
+# Called with (round, who, kind, values) for everything worth keeping; a run folder's `log` fits.
+Report = Callable[[int, str, str, dict[str, Any]], None]
+
+MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # their lengths
+MOST_FRAMES = 2**40  # three thousand years of frames: keeps the sum of all counts in 64 bits, and is no other defence
+LARGEST = float(np.finfo(np.float32).max)  # policies normalise in float32; its square is still finite in float64
+ROUNDING = 1e-6  # of the largest value: how far a mean may lie outside its range
+
+
+class TooFewReplies(RuntimeError):
+    """A round has fewer good replies than the run requires."""
+
+
+@dataclass(frozen=True)
+class Introduction:
+    """What a client says about itself before training."""
+
+    partition_id: int
+    num_examples: int  # training frames
+    stats: Stats
+
+
+@dataclass(frozen=True)
+class Roster:
+    """Which node holds which partition."""
+
+    partition_of: dict[int, int]  # node id -> partition id
+    examples_of: dict[int, int] = field(default_factory=dict)  # node id -> training frames it introduced itself with
+
+    def name(self, node_id: int) -> str:
+        """Return the client's name: ``client_3`` holds partition 3."""
+        return client_name(self.partition_of[node_id])
+
+    def draw(self, share: float, rng: np.random.Generator) -> list[int]:
+        """Draw a share of the clients without replacement (one at least, none if it is 0): node ids by partition."""
+        nodes = sorted(self.partition_of, key=self.partition_of.get)
+        size = draw_size(share, len(nodes))
+        return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
+
+
+def draw_size(share: float, num_clients: int) -> int:
+    """Return how many clients a round draws: a share of them, one at least, none if the share is 0."""
+    return max(1, round(share * num_clients)) if share else 0
+
+
+def client_name(partition_id: int) -> str:
+    """Return the name a client has in metrics, folders and messages."""
+    return f"client_{partition_id}"
+
+
+def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
+    """Return the ids of all connected nodes once there are `num_clients`.
+
+    Raises:
+        TooFewReplies: fewer have connected when the time is up.
+    """
+    deadline = time.monotonic() + timeout_s
+    while len(nodes := sorted(grid.get_node_ids())) < num_clients:
+        if time.monotonic() > deadline:
+            raise TooFewReplies(
+                f"{len(nodes)} of num-clients={num_clients} clients connected within {timeout_s:.0f} s: start more "
+                f"(flwr run --federation-config num-supernodes={num_clients}) or give num-clients={len(nodes) or 1}"
+            )
+        time.sleep(0.5)
+    return nodes
+
+
+def call(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> tuple[Roster, list[Introduction]]:
+    """Ask every node for its partition, frames and statistics; leave out, and report, whose answer cannot be used.
+
+    Returns:
+        the roster, and the introductions in the order of partitions.
+    """
+    messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
+    replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
+    known: dict[int, Introduction] = {}
+    for reply in replies:
+        try:
+            known[reply.metadata.src_node_id] = _introduction(reply, known.values())
+        except ParameterError as error:
+            values = {"to": "query", "reason": error.kind, "detail": str(error)}
+            report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
+    by_partition = sorted(known, key=lambda node: known[node].partition_id)
+    members = Roster(
+        {node: known[node].partition_id for node in by_partition},
+        {node: known[node].num_examples for node in by_partition},
+    )
+    return members, [known[node] for node in by_partition]
+
+
+def answered(reply: Message | None) -> Message:
+    """Return `reply` if the client answered with content.
+
+    Raises:
+        ParameterError: no answer, or an error in its place.
+    """
+    if reply is None:
+        raise ParameterError("silent", "no reply came in time")
+    if reply.has_error():
+        raise ParameterError("error", " ".join(str(reply.error.reason).split()) or f"error code {reply.error.code}")
+    return reply
+
+
+def _introduction(reply: Message, others: Iterable[Introduction]) -> Introduction:
+    note = answered(reply).content.config_records.get(NOTE, {})
+    partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
+    taken = {other.partition_id for other in others}
+    if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
+        raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
+    if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
+        text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
+        raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
+    try:
+        return Introduction(partition_id, num_examples, _statistics(note.get("stats"), num_examples))
+    except ParameterError as error:
+        raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
+
+
+def _statistics(text: Any, num_examples: int) -> Stats:
+    """Return a client's statistics if they can be pooled with those of others.
+
+    Raises:
+        ParameterError: what is wrong, in one line.
+    """
+    if not isinstance(text, str):
+        raise ParameterError("statistics", f"statistics are no text but {type(text).__name__}")
+    try:
+        stats = unpack_stats(text)
+    # A text that is no JSON or ragged, one of another structure, one nested too deep.
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ParameterError("statistics", f"statistics cannot be read: {error!r}") from error
+    _check_keys("statistics", stats, (STATE_KEY, ACTION_KEY))
+    for key, of_feature in stats.items():
+        _check_keys(key, of_feature, MEASURES)
+        _check_measures(key, of_feature)
+        if of_feature["count"][0] != num_examples:
+            count = int(of_feature["count"][0])
+            raise ParameterError("examples", f"{key} counts {count} frames, but num-examples={num_examples}")
+    return stats
+
+
+def _check_keys(what: str, found: Iterable[str], expected: Iterable[str]) -> None:
+    if set(found) != set(expected):
+        raise ParameterError("statistics", f"{what}: got {sorted(found)}, expected {sorted(expected)}")
+
+
+def _check_measures(key: str, measures: dict[str, np.ndarray]) -> None:
+    """Return if the measures of one feature are numbers that some frames could have."""
+    for name, length in MEASURES.items():
+        value, kind = measures[name], "i" if name == "count" else "f"
+        if value.dtype.kind != kind or value.shape != (length,):
+            found = f"{value.dtype} {value.shape}"
+            raise ParameterError("statistics", f"{key}.{name} is {found}, expected {length} numbers")
+        if not (np.abs(value) <= LARGEST).all():  # NaN is not smaller either
+            raise ParameterError("statistics", f"{key}.{name} holds values that are not finite in float32")
+    mean, lowest, highest = measures["mean"], measures["min"], measures["max"]
+    if (measures["std"] < 0).any():
+        raise ParameterError("statistics", f"{key}.std is below 0")
+    slack = ROUNDING * np.maximum(np.abs(lowest), np.abs(highest))
+    if (lowest > highest).any() or (mean < lowest - slack).any() or (mean > highest + slack).any():
+        raise ParameterError("statistics", f"{key}: a mean lies outside its min and max")

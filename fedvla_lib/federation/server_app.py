@@ -1,0 +1,241 @@
+"""The Flower ServerApp: pool the clients' statistics, average their training round by round, judge and keep each model.
+
+The run folder's place is left in ``context.state["run"]["folder"]`` for whoever started the app.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
+from flwr.serverapp import Grid, ServerApp
+
+from fedvla_lib import files, run_folder
+from fedvla_lib.config import Config, from_run_config, task_names
+from fedvla_lib.data import frame_store, normalisation, splits
+from fedvla_lib.evaluation import measure
+from fedvla_lib.evaluation.held_out import average, by_episode, held_out_frames
+from fedvla_lib.evaluation.rollouts import roll_out, rollout_seeds, success_rate
+from fedvla_lib.federation import checkpoint, client, messages
+from fedvla_lib.federation.checkpoint import Checkpoint
+from fedvla_lib.federation.messages import Rollouts
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, call, client_name, wait_for_nodes
+from fedvla_lib.federation.strategies import checked
+from fedvla_lib.federation.strategies.build import build_strategy
+from fedvla_lib.federation.throttled_grid import for_simulation
+from fedvla_lib.policy import model
+from fedvla_lib.policy.parameters import Arrays, load_arrays, shapes_of
+from fedvla_lib.robot.tasks import check_tasks
+from fedvla_lib.run_folder import GLOBAL, RunFolder
+
+CONNECT_TIMEOUT_S = 60.0  # how long to wait for clients to connect
+
+
+class ClientStates(Protocol):
+    """An engine that can say, and restore, what its clients keep from round to round."""
+
+    def client_states(self) -> dict[str, Arrays]:
+        """Return what clients keep, by client and kind, then by name."""
+
+    def restore_clients(self, states: dict[str, Arrays]) -> None:
+        """Give clients back what they kept."""
+
+
+def build(
+    tools: client.Loaders = client.LOADERS,
+    *,
+    engine: str = "flower",
+    progress: bool = False,
+    states: ClientStates | None = None,
+) -> ServerApp:
+    """Return the ServerApp.
+
+    Args:
+        engine: written into the stamp.
+        progress: show bars for rollouts.
+        states: reaches what clients keep, where the engine can; else only runs whose clients keep nothing can resume.
+    """
+    app = ServerApp()
+
+    @app.main()
+    def main(grid: Grid, context: Context) -> None:
+        config = from_run_config(context.run_config)
+        with run_folder.start(config, engine=engine) as run:
+            context.state["run"] = ConfigRecord({"folder": str(run.root)})
+            federate(for_simulation(grid), config, run, tools, progress, states)
+
+    return app
+
+
+def federate(
+    grid: Grid,
+    config: Config,
+    run: RunFolder,
+    tools: client.Loaders,
+    progress: bool,
+    states: ClientStates | None = None,
+) -> None:
+    """Carry out a federated run on `grid`, or the rest of one, and write it to `run`.
+
+    Raises:
+        TooFewReplies: too few clients connected, or a round had fewer good replies than `config.min_replies`.
+        ValueError: settings or data that cannot be used.
+    """
+    check_tasks(task_names(config))
+    before = _before(config, run, states)
+    store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
+    members, weights, pooled = _introduce(grid, config, run)
+    stats = normalisation.common_statistics(config, pooled)
+    bundle = model.load_policy(config, normalisation.judging_statistics(config, stats, store))
+    arrays, done = bundle.shared_arrays(), 0
+    if before:  # in the order of the model, which is not that of the file
+        arrays, done = {name: before.arrays[name] for name in arrays}, before.round
+    strategy = build_strategy(
+        config,
+        weights,
+        roster=members,
+        shapes=shapes_of(arrays),
+        report=run.log,
+        keep_rollouts=lambda round_number, who, rollouts: _keep_rollouts(run, round_number, who, rollouts),
+        train_share=config.fraction_train,
+        evaluate_share=config.fraction_evaluate,
+        min_replies=config.min_replies,
+        seed=config.seed,
+        exchange=config.exchange,
+        clip_norm=config.clip_norm,
+        rounds_done=done,
+    )
+    if before:
+        strategy.remember(checkpoint.nested(before.strategy))
+    judge = GlobalEvaluator(config, store, bundle, run, progress)
+    strategy.start(
+        grid,
+        messages.pack_arrays(arrays),
+        num_rounds=config.num_server_rounds - done,
+        timeout=config.round_timeout_s,
+        train_config=ConfigRecord({messages.STATS: normalisation.pack_stats(stats)}),
+        evaluate_config=ConfigRecord({messages.STATS: normalisation.pack_stats(stats)}),
+        evaluate_fn=RoundEnd(judge, strategy, run, states, done),
+    )
+
+
+@dataclass(frozen=True)
+class RoundEnd:
+    """Judges the model of a round, then keeps all that the next one needs. Flower calls it first for round 0."""
+
+    judge: "GlobalEvaluator"
+    strategy: checked.Checked
+    run: RunFolder
+    states: ClientStates | None
+    done: int  # rounds completed by an earlier process
+
+    def __call__(self, flowers_round: int, record: ArrayRecord) -> MetricRecord | None:
+        """Close a round; what an earlier process closed stays as it is."""
+        if self.done and flowers_round == 0:
+            return None
+        number = self.done + flowers_round
+        measured = self.judge(number, record)
+        memory, kept = self.strategy.memory(), self.states.client_states() if self.states else {}
+        arrays = messages.unpack_arrays(record)
+        checkpoint.save(self.run.root, Checkpoint(number, arrays, checkpoint.flat(memory), checkpoint.flat(kept)))
+        return measured
+
+
+def _before(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
+    """Return where the run to be resumed stood after its last complete round, and clear what came of the next."""
+    if not config.resume:
+        return None
+    kept_by_clients = [name for name, kept in client.kept_between_rounds(config).items() if kept]
+    if kept_by_clients and not states:
+        raise ValueError(
+            f"{kept_by_clients[0]} lets clients keep something from round to round, which ended with the run on this "
+            "engine: resume on engine inline, or start anew"
+        )
+    found = checkpoint.load(run.root)
+    run_folder.forget_after(run.root, found.round)
+    if states:
+        states.restore_clients(checkpoint.nested(found.clients))
+    return found
+
+
+@dataclass(frozen=True)
+class GlobalEvaluator:
+    """Keeps and measures the global model after each round: held-out loss, action error, closed-loop success.
+
+    Where parts of the model are personal, the global model has them as they were before training.
+    """
+
+    config: Config
+    store: frame_store.FrameStore
+    bundle: model.Bundle
+    run: RunFolder
+    progress: bool
+
+    def __call__(self, round_number: int, arrays: ArrayRecord) -> MetricRecord:
+        """Save ``global_model/round_N``, measure it, and log what was found; round 0 is the model before training."""
+        if not measure.is_validated(self.config, round_number):
+            return MetricRecord({})
+        started = time.perf_counter()
+        load_arrays(self.bundle.policy, messages.unpack_arrays(arrays) | self.bundle.own)
+        model.save_policy(self.bundle, self.run.model_dir(round_number))
+        held_out = splits.held_out_episodes(self.store, self.config)
+        frames = held_out_frames(self.bundle, self.store, held_out, self.config)
+        episodes = by_episode(frames, self.store, held_out)
+        for of_episode in episodes:
+            self.run.log(round_number, GLOBAL, "held-out", of_episode)
+        values = (average(frames) if frames else {}) | self._roll_out(round_number)
+        counted = {"num_examples": sum(of_episode["num_examples"] for of_episode in episodes)}
+        seconds = time.perf_counter() - started
+        self.run.log(round_number, GLOBAL, "evaluate", {**counted, **values, "seconds": seconds})
+        return MetricRecord(values)
+
+    def _roll_out(self, round_number: int) -> dict[str, float]:
+        """Return the success rate over all tasks and of each, when rollouts are due."""
+        config = self.config
+        if not config.eval_rollouts or not measure.rolls_out(config, round_number):
+            return {}
+        videos_dir = self.run.videos_dir(round_number, GLOBAL)
+        seeds = rollout_seeds(config.eval_rollouts)
+        rows = roll_out(self.bundle, config, seeds, videos_dir, self.progress)
+        _log_rollouts(self.run, round_number, GLOBAL, rows)
+        by_task = {task: [row for row in rows if row["task"] == task] for task in task_names(config)}
+        return {"success_rate": success_rate(rows)} | {
+            f"success_rate.{task}": success_rate(of_task) for task, of_task in by_task.items()
+        }
+
+
+def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
+    """Learn who holds which partition and how many frames, and pool the clients' statistics.
+
+    Nothing else about the data leaves a client. Returns the roster, each node's share of all frames, the statistics.
+    """
+    nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
+    members, introductions = call(grid, nodes, run.log, config.round_timeout_s)
+    if len(introductions) < config.min_replies:
+        raise TooFewReplies(
+            f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
+            "required; the rejected ones are in metrics.jsonl"
+        )
+    for one in introductions if not config.resume else []:
+        run.log(0, client_name(one.partition_id), "data", {"num_examples": one.num_examples})
+    whole = sum(one.num_examples for one in introductions)
+    weights = {node: one.num_examples / whole for node, one in zip(members.partition_of, introductions, strict=True)}
+    return members, weights, normalisation.pool_stats([one.stats for one in introductions])
+
+
+def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:
+    """Write what a client filmed and log its rows."""
+    folder = run.videos_dir(round_number, who)
+    for name, content in rollouts.files.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        files.write_atomically(folder / name, content)
+    _log_rollouts(run, round_number, who, [{**row, "video": str(folder / row["video"])} for row in rollouts.rows])
+
+
+def _log_rollouts(run: RunFolder, round_number: int, who: str, rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        video = run.relative(row["video"])
+        run.log(round_number, who, "rollout", {**row, "video": video})
+
+
+app = build()

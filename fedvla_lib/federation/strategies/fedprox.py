@@ -1,0 +1,35 @@
+"""FedProx: FedAvg whose clients are pulled towards the global model."""
+
+from collections.abc import Mapping
+
+import torch
+from flwr.serverapp.strategy import FedProx
+
+from fedvla_lib.federation.strategies.checked import Checked
+from fedvla_lib.policy.training import Parameters, with_gradient
+
+
+class Proximal:
+    """FedProx's pull towards the global model: the gradient of mu / 2 ||w - w_global||^2.
+
+    Li et al. 2020, Federated Optimization in Heterogeneous Networks, https://arxiv.org/abs/1812.06127.
+
+    Args:
+        anchor: the parameters as the global model has them, by name. They are copied: an anchor that is the live
+            weights themselves moves along and pulls nowhere.
+        mu: weight of the term; with 0 nothing is added, which leaves FedAvg to the last bit.
+    """
+
+    def __init__(self, anchor: Mapping[str, torch.Tensor], mu: float) -> None:
+        self._anchor = {name: tensor.detach().clone() for name, tensor in anchor.items()}
+        self._mu = mu
+
+    def __call__(self, parameters: Parameters) -> None:
+        """Add mu (w - w_global)."""
+        if self._mu:
+            for name, parameter in with_gradient(parameters, self._anchor):
+                parameter.grad.add_(parameter.detach() - self._anchor[name], alpha=self._mu)
+
+
+class CheckedFedProx(Checked, FedProx):
+    """FedAvg whose clients add mu / 2 ||w - w_global||^2 to their loss (https://arxiv.org/abs/1812.06127)."""

@@ -1,0 +1,78 @@
+"""Lets a policy drive the arm: predict a chunk of actions, carry out part of it, look again."""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from fedvla_lib.policy.model import Bundle
+from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY, Observation, image_key
+
+
+class PolicyActor:
+    """Lets a policy drive the arm: look once, carry out `n_action_steps` of the predicted chunk, look again.
+
+    The flow-matching noise comes from (`seed`, episode seed), so an evaluation can be repeated exactly.
+    """
+
+    def __init__(self, bundle: Bundle, seed: int = 0) -> None:
+        self.bundle = bundle
+        self.seed = seed
+
+    def reset(self, env: Any, seed: int) -> None:
+        """Forget the last episode and read the instruction of this one."""
+        self._queue: deque[np.ndarray] = deque()
+        self._instruction = env.instruction
+        mixed = np.random.SeedSequence([self.seed, seed]).generate_state(1, np.uint64)[0]
+        self._generator = torch.Generator().manual_seed(int(mixed >> 1))
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the next joint targets, float32 (6,): degrees, gripper 0-100."""
+        return self.act_together([self], [observation])[0]
+
+    @staticmethod
+    def act_together(actors: Sequence["PolicyActor"], observations: Sequence[Observation]) -> list[np.ndarray]:
+        """Return the next joint targets of several actors with one policy; those that must look, look at once."""
+        looking = [(actor, seen) for actor, seen in zip(actors, observations, strict=True) if not actor._queue]
+        if looking:
+            bundle = looking[0][0].bundle
+            batch = _joined([_as_batch(seen, actor._instruction) for actor, seen in looking])
+            noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in looking])
+            for (actor, _), chunk in zip(looking, _denoise(bundle, batch, noise), strict=True):
+                actor._queue.extend(chunk[: bundle.policy.config.n_action_steps].numpy())
+        return [actor._queue.popleft() for actor in actors]
+
+
+def predict_chunk(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> torch.Tensor:
+    """Denoise action chunks for a raw batch: float32 (B, chunk_size, 6) on the CPU, in degrees and gripper 0-100."""
+    return _denoise(bundle, batch, _noise(bundle, len(batch["task"]), generator))
+
+
+def _noise(bundle: Bundle, count: int, generator: torch.Generator) -> torch.Tensor:
+    config = bundle.policy.config
+    return torch.randn((count, config.chunk_size, config.max_action_dim), generator=generator)
+
+
+def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torch.Tensor:
+    inputs = {key: value for key, value in batch.items() if key not in (ACTION_KEY, "action_is_pad")}
+    noise = noise.to(bundle.policy.config.device)
+    chunk = bundle.policy.predict_action_chunk(bundle.preprocess(inputs), noise=noise)  # (B, chunk, 6) normalised
+    return bundle.postprocess(chunk)
+
+
+def _joined(batches: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Raw batches of one, as one raw batch."""
+    tensors = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0] if key != "task"}
+    return tensors | {"task": [text for batch in batches for text in batch["task"]]}
+
+
+def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
+    """Turn one Gymnasium observation into a raw batch of one."""
+    batch: dict[str, Any] = {"task": [instruction]}
+    for camera, pixels in observation["pixels"].items():
+        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]  # (1, 3, H, W)
+        batch[image_key(camera)] = image.float() / 255
+    batch[STATE_KEY] = torch.from_numpy(np.asarray(observation["agent_pos"], np.float32))[None]  # (1, 6)
+    return batch

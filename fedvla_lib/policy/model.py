@@ -1,0 +1,226 @@
+"""Build or load a SmolVLA policy, choose what trains, and let it drive the arm.
+
+Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: the pretrained
+nano model that comes with this package (`pretrain` made it), the same with random weights, a local `pretrained_model`
+folder, or a hub id such as ``lerobot/smolvla_base``.
+"""
+
+import contextlib
+import io
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OfflineModeIsEnabled
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
+from safetensors import safe_open
+
+from fedvla_lib.config import Config, granted_threads, personal_parts
+from fedvla_lib.data.normalisation import Stats
+from fedvla_lib.files import cache_dir, safetensors_errors_named
+from fedvla_lib.policy.lora import add_adapters, merged
+from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano, nano_base
+from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
+
+POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
+VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A policy with the processors that turn raw batches into its inputs and its outputs into joint targets."""
+
+    policy: SmolVLAPolicy
+    preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
+    postprocess: Any  # normalised actions -> degrees and gripper 0-100
+    own: Arrays = field(default_factory=dict)  # what is personal, as it was when the policy was loaded
+
+    def shared(self) -> dict[str, torch.nn.Parameter]:
+        """Return the live parameters that train and belong to everybody, by name."""
+        return {name: p for name, p in trainable(self.policy).items() if name not in self.own}
+
+    def shared_arrays(self) -> Arrays:
+        """Return copies of what travels, float32, by name."""
+        return {name: array for name, array in trainable_arrays(self.policy).items() if name not in self.own}
+
+
+def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
+    """Return the policy that `config.base` names, frozen as `config` says, in evaluation mode.
+
+    Args:
+        stats: normalisation statistics of state and action. None takes those saved with the base.
+
+    Raises:
+        ValueError: the base cannot be found or lacks weights, or no statistics are known.
+    """
+    torch.set_num_threads(granted_threads(config))  # sums in another order differ in their last bits
+    if stats is None and config.base == NANO_RANDOM:
+        raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
+    source = str(nano_base()) if config.base == NANO else config.base
+    policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
+    if config.lora_rank:
+        chosen = {"freeze_a": config.lora_freeze_a, "adapt_state": config.train_state_proj, "seed": config.seed}
+        add_adapters(policy, config.lora_rank, **chosen)
+    policy.eval()
+    return Bundle(policy, *_processors(policy, stats, source), _own(policy, personal_parts(config)))
+
+
+def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
+    """The arrays of the parts that stay with a client.
+
+    Raises:
+        ValueError: a part that nothing trainable belongs to, or nothing is left to share.
+    """
+    arrays = trainable_arrays(policy) if parts else {}
+    known = sorted({layer_of(name) for name in arrays})
+    if unknown := [part for part in parts if part not in known]:
+        raise ValueError(f"personal={unknown[0]!r} is not a part that trains: choose from {', '.join(known)}")
+    if parts and set(parts) == set(known):
+        raise ValueError(f"personal={', '.join(parts)!r} leaves nothing to share: leave out one of {', '.join(known)}")
+    return {name: array for name, array in arrays.items() if layer_of(name) in parts}
+
+
+def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
+    """Return one row per part of the model: module, parameters, trainable parameters and the reader's name for it."""
+    rows = []
+    for prefix, meaning in MODULES.items():
+        named = [p for name, p in policy.named_parameters() if name.startswith(prefix)]
+        trainable = sum(p.numel() for p in named if p.requires_grad)
+        total = sum(p.numel() for p in named)
+        rows.append({"module": prefix, "part": meaning, "parameters": total, "trainable": trainable})
+    return rows
+
+
+MODULES = {
+    "model.vlm_with_expert.vlm.model.vision_model": "vision encoder",
+    "model.vlm_with_expert.vlm.model.connector": "connector (pixel shuffle + projection)",
+    "model.vlm_with_expert.vlm.model.text_model": "language model",
+    "model.vlm_with_expert.vlm.lm_head": "language head (unused by the policy)",
+    "model.vlm_with_expert.lm_expert": "action expert",
+    "model.state_proj": "state projection",
+    "model.action_in_proj": "action input projection",
+    "model.action_out_proj": "action output projection",
+    "model.action_time_mlp": "action-time MLP",
+}
+
+
+def save_policy(bundle: Bundle, folder: Path) -> None:
+    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, adapters merged in.
+
+    Raises:
+        FileExistsError: `folder` is there already; nothing is overwritten.
+        OSError: it cannot be written; the message names it.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists already: a saved policy is never overwritten")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch, safetensors_errors_named(folder):
+        target = Path(scratch) / "policy"
+        merged(bundle.policy).save_pretrained(target)
+        bundle.preprocess.save_pretrained(target)
+        bundle.postprocess.save_pretrained(target)
+        backbone = Path(bundle.policy.config.vlm_model_name)
+        if backbone.is_dir():
+            shutil.copytree(backbone, target / VLM_FOLDER)
+        os.replace(target, folder)
+
+
+def _random_nano(config: Config) -> SmolVLAPolicy:
+    """Random weights that depend on the seed alone, whatever was drawn before."""
+    settings = SmolVLAConfig(
+        vlm_model_name=str(ensure_nano(cache_dir(), config.image_size)),
+        num_vlm_layers=0,  # 0 keeps all layers the backbone has
+        resize_imgs_with_padding=(config.image_size, config.image_size),
+        device=config.device,  # left out, LeRobot looks for an accelerator and logs two warnings
+    )
+    _adapt(settings, config)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        policy = SmolVLAPolicy(settings)
+        # The default (0.02) drowns where a patch lies in what it shows; at this scale the model learns to locate.
+        torch.nn.init.normal_(_vision_positions(policy), std=POSITION_STD)
+    return policy.to(config.device)
+
+
+def _vision_positions(policy: SmolVLAPolicy) -> torch.Tensor:
+    return policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings.position_embedding.weight
+
+
+def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
+    try:
+        settings = PreTrainedConfig.from_pretrained(base)
+        if not isinstance(settings, SmolVLAConfig):
+            raise ValueError(f"base={base!r} is a {settings.type!r} policy: give a smolvla one")
+        _adapt(settings, config)
+        settings.load_vlm_weights = False  # the policy's own file holds them, fine-tuned
+        if (Path(base) / VLM_FOLDER).is_dir():
+            settings.vlm_model_name = str((Path(base) / VLM_FOLDER).resolve())
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line per load
+            policy = SmolVLAPolicy.from_pretrained(base, config=settings)
+    except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
+        raise ValueError(_not_found(config.base, error)) from error
+    _require_all_weights(policy, base)
+    return policy
+
+
+def _not_found(base: str, error: Exception) -> str:
+    reason = str(error).strip().splitlines()[0][:160]
+    return (
+        f"base={base!r} could not be loaded ({reason}): give {NANO!r}, {NANO_RANDOM!r}, a folder in LeRobot's "
+        "pretrained_model format, or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
+    )
+
+
+def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:
+    """LeRobot only logs missing tensors; a policy that is partly random must not pass for a pretrained one."""
+    file = Path(base) / WEIGHTS_FILE
+    if not file.is_file():
+        return  # from the hub cache: the file's place is LeRobot's business
+    with safe_open(file, "pt") as weights:
+        missing = sorted(set(policy.state_dict()) - set(weights.keys()))
+    if missing:
+        raise ValueError(f"{file} lacks {len(missing)} tensors of the policy, {missing[0]!r} first")
+
+
+def _adapt(settings: SmolVLAConfig, config: Config) -> None:
+    """Set what a run decides: cameras and sizes, chunk, device, and what is frozen."""
+    shape = (3, config.image_size, config.image_size)
+    settings.input_features = {image_key(camera): PolicyFeature(FeatureType.VISUAL, shape) for camera in CAMERAS}
+    settings.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))
+    settings.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
+    settings.chunk_size = config.chunk_size
+    settings.n_action_steps = config.n_action_steps
+    settings.freeze_vision_encoder = config.freeze_vision_encoder
+    settings.train_expert_only = config.train_expert_only
+    settings.train_state_proj = config.train_state_proj
+    settings.device = config.device
+
+
+def _processors(policy: SmolVLAPolicy, stats: Stats | None, base: str) -> tuple[Any, Any]:
+    if stats is not None:
+        return make_pre_post_processors(policy.config, dataset_stats=_as_tensors(stats))
+    overrides = {
+        "device_processor": {"device": str(policy.config.device)},
+        "tokenizer_processor": {"tokenizer_name": policy.config.vlm_model_name},
+    }
+    return make_pre_post_processors(policy.config, pretrained_path=base, preprocessor_overrides=overrides)
+
+
+def _as_tensors(stats: Stats) -> dict[str, dict[str, torch.Tensor]]:
+    """A missing key would silently skip normalisation in LeRobot, so its absence is an error here."""
+    for key in (STATE_KEY, ACTION_KEY):
+        if not {"mean", "std"} <= set(stats.get(key, ())):
+            raise ValueError(f"statistics lack mean and std of {key!r}: got {sorted(stats)}")
+    return {
+        key: {name: torch.as_tensor(np.asarray(value), dtype=torch.float32) for name, value in feature.items()}
+        for key, feature in stats.items()
+    }

@@ -1,0 +1,177 @@
+"""The nano vision-language backbone: a folder that LeRobot's unchanged `SmolVLAPolicy` accepts as `vlm_model_name`.
+
+It has the parts of SmolVLM2 (SigLIP-style vision tower, pixel-shuffle connector, Llama-style text model, BPE tokenizer
+with SmolVLM's special tokens) at a width of 128. Its weights are random: it is an architecture to learn with, not a
+language model.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
+from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+
+PACKAGE = "fedvla-lib"
+NANO, NANO_RANDOM = "nano", "nano-random"  # names of a base
+WEIGHTS_FILE = "model.safetensors"
+WIDTH = 128
+TEXT_LAYERS = 4
+VISION_LAYERS = 3
+PATCHES_PER_SIDE = 8  # the patch size follows the image size, so compute does not
+CONNECTOR_SCALE = 2  # pixel shuffle folds 2 x 2 patches into one token: 16 tokens per camera
+VOCAB_SIZE = 384
+SPECIAL_TOKENS = [
+    "<|im_start|>",
+    "<|im_end|>",
+    "<fake_token_around_image>",
+    "<image>",
+    "<global-img>",
+    "<end_of_utterance>",
+]
+
+
+# The tokenizer learns its merges from these words; bytes it never saw still encode, only less compactly.
+CORPUS = [
+    f"{verb} the {color} {thing}."
+    for verb in ("Lift", "Put", "Push", "Pick up", "Move", "Stack", "Sort", "Slide", "Place")
+    for color in ("red", "green", "blue", "yellow", "white", "black", "orange")
+    for thing in ("cube", "cube into the zone", "cube in the bin", "block on the table", "cube on the left", "right")
+]
+
+
+def ensure_nano(cache: Path, image_size: int) -> Path:
+    """Return the folder of the nano backbone for `image_size` pixels under `cache`, writing it when it is not there.
+
+    Raises:
+        ValueError: `image_size` is not a multiple of the number of patches per side.
+    """
+    folder = cache / f"nano-vlm-{image_size}"
+    if not (folder / "config.json").exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as scratch:
+            write_nano(Path(scratch) / "vlm", image_size)
+            _publish(Path(scratch) / "vlm", folder)
+    return folder
+
+
+def write_nano(folder: Path, image_size: int) -> None:
+    """Write config, tokenizer and processors of the nano backbone into `folder`."""
+    if image_size % PATCHES_PER_SIDE:
+        raise ValueError(f"image_size={image_size} is not usable: give a multiple of {PATCHES_PER_SIDE} pixels")
+    tokenizer = _tokenizer()
+    _config(image_size, tokenizer).save_pretrained(folder)
+    size = {"longest_edge": image_size}
+    SmolVLMProcessor(
+        image_processor=SmolVLMImageProcessor(size=size, max_image_size=size),
+        tokenizer=tokenizer,
+        video_processor=SmolVLMVideoProcessor(size=size, max_image_size=size),
+        image_seq_len=(PATCHES_PER_SIDE // CONNECTOR_SCALE) ** 2,
+    ).save_pretrained(folder)
+
+
+def _config(image_size: int, tokenizer: PreTrainedTokenizerFast) -> SmolVLMConfig:
+    vision = {
+        "hidden_size": WIDTH,
+        "intermediate_size": 2 * WIDTH,
+        "num_hidden_layers": VISION_LAYERS,
+        "num_attention_heads": 4,
+        "image_size": image_size,
+        "patch_size": image_size // PATCHES_PER_SIDE,
+    }
+    text = {
+        "model_type": "llama",
+        "hidden_size": WIDTH,
+        "intermediate_size": 2 * WIDTH,
+        "num_hidden_layers": TEXT_LAYERS,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "head_dim": WIDTH // 4,
+        "vocab_size": len(tokenizer),
+        "max_position_embeddings": 512,
+        "pad_token_id": tokenizer.pad_token_id,
+    }
+    return SmolVLMConfig(
+        vision_config=vision,
+        text_config=text,
+        scale_factor=CONNECTOR_SCALE,
+        image_token_id=tokenizer.convert_tokens_to_ids("<image>"),
+        pad_token_id=tokenizer.pad_token_id,
+    )
+
+
+def _tokenizer() -> PreTrainedTokenizerFast:
+    bpe = Tokenizer(models.BPE())
+    bpe.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    bpe.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=VOCAB_SIZE,
+        special_tokens=SPECIAL_TOKENS,
+        initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )
+    bpe.train_from_iterator(CORPUS, trainer)
+    return PreTrainedTokenizerFast(
+        tokenizer_object=bpe,
+        bos_token="<|im_start|>",
+        eos_token="<|im_end|>",
+        pad_token="<|im_end|>",
+        extra_special_tokens={
+            "fake_image_token": "<fake_token_around_image>",
+            "image_token": "<image>",
+            "global_image_token": "<global-img>",
+            "end_of_utterance_token": "<end_of_utterance>",
+        },
+    )
+
+
+def _publish(source: Path, target: Path) -> None:
+    """Move a finished folder into place; when another process was faster, keep its copy."""
+    try:
+        os.replace(source, target)
+    except OSError:
+        if not target.exists():
+            raise
+        shutil.rmtree(source)
+
+
+def nano_base() -> Path:
+    """Return the folder of the pretrained nano model.
+
+    Flower's app bundle takes no weights, so a library that runs from a bundle looks where the package is installed.
+
+    Raises:
+        ValueError: it is in neither place.
+    """
+    places = [Path(__file__).parents[1], *_installed()]
+    for place in places:
+        if (place / "nano_base" / WEIGHTS_FILE).is_file():
+            return place / "nano_base"
+    raise ValueError(
+        f"base={NANO!r} is not here and the package fedvla-lib is not installed: install it on every machine of the "
+        "federation, or give another base"
+    )
+
+
+def _installed() -> list[Path]:
+    """Where the installed package's modules may be: in site-packages, or in the folder of an editable installation."""
+    try:
+        package = distribution(PACKAGE)
+    except PackageNotFoundError:
+        return []
+    source = json.loads(package.read_text("direct_url.json") or "{}").get("url", "")
+    places = [Path(str(package.locate_file("fedvla_lib")))]
+    return places + ([Path(url2pathname(urlsplit(source).path)) / "fedvla_lib"] if source.startswith("file:") else [])
+
+
+def base_digest(base: str) -> str:
+    """Return a short hash of the weights that a base names, or its name where the weights are not a local file."""
+    file = (nano_base() if base == NANO else Path(base)) / WEIGHTS_FILE
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else base

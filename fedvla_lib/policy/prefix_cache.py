@@ -1,0 +1,169 @@
+"""Compute once what a frozen vision-language model says about a frame, and train the action expert on that.
+
+SmolVLA's prefix (images, instruction, state) never attends to the actions behind it. While everything that makes the
+prefix is frozen and images are not augmented, its keys and values are constants of a frame: they are computed once with
+the policy's own methods, kept in a memory-mapped file, and each training step runs the expert alone. The loss and its
+gradients equal `SmolVLAPolicy.forward`'s.
+"""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.common.vla_utils import make_att_2d_masks
+from lerobot.policies.smolvla import SmolVLAPolicy
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from safetensors.torch import save
+from tqdm.auto import tqdm
+from transformers import DynamicCache
+
+from fedvla_lib.data.batches import Batches, batch_of_rows, targets_of_rows
+from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.files import cache_dir
+from fedvla_lib.policy.model import Bundle
+from fedvla_lib.robot.spec import ACTION_KEY
+
+PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and which positions are real
+BATCH = 64  # frames per forward pass while filling the store
+
+
+@dataclass(frozen=True)
+class PrefixStore:
+    """Keys and values of every frame of a data set under one frozen model."""
+
+    cache: np.ndarray  # float32 (N, layers, 2, kv heads, prefix length, head dim): keys, then values
+    real: np.ndarray  # bool (N, prefix length): False where the instruction was padded
+
+    def rows(self, rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return keys and values, and the mask, of the frames `rows`."""
+        return torch.from_numpy(self.cache[rows]), torch.from_numpy(self.real[rows])
+
+
+class PrefixBatches:
+    """Training batches that carry the stored prefix instead of images: the same rows in the same order."""
+
+    def __init__(self, batches: Batches, prefixes: PrefixStore) -> None:
+        self._batches, self._prefixes = batches, prefixes
+        self.seed, self.num_examples = batches.seed, batches.num_examples
+
+    def at(self, step: int) -> dict[str, Any]:
+        """Return the batch of a step: targets in degrees, padding mask, task, and the prefix."""
+        rows = self._batches.rows_at(step)
+        return targets_of_rows(self._batches.store, rows, self._batches.chunk_size) | {
+            PREFIX_KEY: self._prefixes.rows(rows)
+        }
+
+
+def with_cached_prefixes(bundle: Bundle, batches: Batches, progress: bool = False) -> Batches | PrefixBatches:
+    """Return the same training batches with stored prefixes where these are constant, else `batches` itself."""
+    if batches.augment or not is_constant(bundle.policy):
+        return batches
+    return PrefixBatches(batches, ensure_prefixes(bundle, batches.store, cache_dir() / "prefixes", progress))
+
+
+def is_constant(policy: SmolVLAPolicy) -> bool:
+    """Tell whether training leaves the prefix of a frame as it is."""
+    settings = policy.config
+    return settings.freeze_vision_encoder and settings.train_expert_only and not settings.train_state_proj
+
+
+def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+    """Flow-matching loss of a batch with stored prefix: mean of (v - (noise - action))^2 over real action entries.
+
+    Args:
+        noise: float32 (B, chunk, max_action_dim), x_1 of the flow.
+        times: float32 (B,), t in (0, 1); the expert sees x_t = t noise + (1 - t) action.
+    """
+    policy = bundle.policy
+    stored, real = batch[PREFIX_KEY]
+    inputs = bundle.preprocess({key: value for key, value in batch.items() if key != PREFIX_KEY})
+    actions = policy.prepare_action(inputs)  # (B, chunk, max_action_dim) normalised
+    mixed = times[:, None, None] * noise + (1 - times[:, None, None]) * actions
+    velocity = policy.model.denoise_step(real.to(noise.device), _as_cache(stored.to(noise.device)), mixed, times)
+    squared = ((noise - actions) - velocity).square()[..., : policy.config.action_feature.shape[0]]
+    valid = ~inputs["action_is_pad"]
+    return (squared * valid[..., None]).sum() / (valid.sum() * squared.shape[-1]).clamp_min(1)
+
+
+def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
+    """Return the prefixes of every frame of `store`, computing them into `folder` unless this model's are there."""
+    target = folder / f"prefix-{_fingerprint(bundle, store)}"
+    if not (target / "real.npy").exists():
+        _fill(bundle, store, target, progress)
+    return PrefixStore(np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
+
+
+@torch.no_grad()
+def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> None:
+    """Write cache.npy, then real.npy, each moved into place when whole; the second marks the store complete."""
+    target.mkdir(parents=True, exist_ok=True)
+    count, length, cache = len(store.states), _longest(bundle, store), None
+    scratch = target / f".cache-{os.getpid()}.npy"
+    real = []
+    for start in tqdm(range(0, count, BATCH), desc="frozen prefixes", disable=not progress):
+        rows = np.arange(start, min(start + BATCH, count))
+        stored, mask = prefill(bundle, batch_of_rows(store, rows, bundle.policy.config.chunk_size), length)
+        if cache is None:
+            shape = (count, *stored.shape[1:])
+            cache = np.lib.format.open_memmap(scratch, mode="w+", dtype=np.float32, shape=shape)
+        cache[rows] = stored.cpu().numpy()
+        real.append(mask.cpu().numpy())
+    cache.flush()
+    os.replace(scratch, target / "cache.npy")
+    part = target / f".real-{os.getpid()}.npy"
+    np.save(part, np.concatenate(real))
+    os.replace(part, target / "real.npy")
+
+
+def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Run images, instruction and state through the vision-language model, with gradients unless they are off.
+
+    Returns:
+        keys and values, (B, layers, 2, kv heads, L, head dim), and which positions are real, bool (B, L); instructions
+        are padded to at least `length` tokens.
+    """
+    policy = bundle.policy
+    inputs = bundle.preprocess({key: value for key, value in batch.items() if key != ACTION_KEY})
+    images, image_masks = policy.prepare_images(inputs)
+    tokens, words = _pad(inputs[OBS_LANGUAGE_TOKENS], length), _pad(inputs[OBS_LANGUAGE_ATTENTION_MASK], length)
+    embedded, real, blocks = policy.model.embed_prefix(images, image_masks, tokens, words, policy.prepare_state(inputs))
+    _, cache = policy.model.vlm_with_expert.forward(
+        attention_mask=make_att_2d_masks(real, blocks),
+        position_ids=torch.cumsum(real, dim=1) - 1,
+        inputs_embeds=[embedded, None],
+        use_cache=True,
+    )
+    return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in cache.layers], 1), real
+
+
+def _as_cache(stored: torch.Tensor) -> DynamicCache:
+    cache = DynamicCache()
+    for layer in range(stored.shape[1]):
+        cache.update(stored[:, layer, 0], stored[:, layer, 1], layer)
+    return cache
+
+
+def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
+    return torch.nn.functional.pad(tokens, (0, max(0, length - tokens.shape[1])))
+
+
+def _longest(bundle: Bundle, store: FrameStore) -> int:
+    """Tokens of the longest instruction in the data set."""
+    first = store.episodes.drop_duplicates("instruction").start.to_numpy()
+    return bundle.preprocess(batch_of_rows(store, first, bundle.policy.config.chunk_size))[OBS_LANGUAGE_TOKENS].shape[1]
+
+
+def _fingerprint(bundle: Bundle, store: FrameStore) -> str:
+    """Everything the prefix depends on: frozen weights, statistics, and the data set's identity."""
+    frozen = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if not p.requires_grad}
+    digest = hashlib.sha256(save(frozen))
+    for step in bundle.preprocess.steps:
+        for name, value in sorted(step.state_dict().items()):
+            digest.update(name.encode() + value.cpu().numpy().tobytes())
+    digest.update(f"{store.root}|{len(store.states)}".encode() + np.ascontiguousarray(store.states).tobytes())
+    digest.update("|".join(store.episodes.instruction).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,237 @@
+"""Local training and validation of one policy: what a client does between two messages.
+
+Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's own flow-matching loss with
+padded actions masked.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.common.train_utils import load_training_state, save_training_state
+from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
+from safetensors.torch import load_file, save_file
+from tqdm.auto import tqdm
+
+from fedvla_lib.config import Config, granted_threads
+from fedvla_lib.files import safetensors_errors_named
+from fedvla_lib.policy.model import Bundle
+from fedvla_lib.policy.parameters import Arrays, trainable
+from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
+
+Parameters = Mapping[str, torch.nn.Parameter]
+
+
+class Correction(Protocol):
+    """Called after each backward pass, before clipping, with the trainable parameters by name."""
+
+    def __call__(self, parameters: Parameters) -> None:
+        """Change the gradients in place."""
+
+
+WEIGHTS_FILE = "trainable.safetensors"
+LOSSES_FILE = "losses.json"
+
+
+Loss = Callable[[Bundle, dict[str, Any]], torch.Tensor]  # of a policy on a raw batch
+
+
+class TrainingBatches(Protocol):
+    """An endless, seekable supply of raw batches: `data.Batches`."""
+
+    seed: int
+    num_examples: int
+
+    def at(self, step: int) -> dict[str, Any]:
+        """Return the raw batch of a step; the same step gives the same batch."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a client reports after local training."""
+
+    losses: list[float]  # flow-matching loss of each step, in order
+    num_examples: int  # training frames of the client: its weight in federated averaging
+    steps: int  # optimiser steps behind the weights, counted as they were done, those before a resume included
+    seconds: float  # wall time of this call
+    moments: Arrays = field(default_factory=dict)  # the optimiser's state by name, for who goes on from here
+
+
+def local_train(
+    bundle: Bundle,
+    batches: TrainingBatches,
+    config: Config,
+    *,
+    steps: int,
+    start_step: int = 0,
+    total_steps: int | None = None,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: bool = True,
+    loss: Loss | None = None,
+    correction: Correction | None = None,
+    moments: Arrays | None = None,
+) -> TrainResult:
+    """Train the policy's trainable parameters in place for `steps` steps, from `start_step` of a schedule.
+
+    Args:
+        start_step: steps done in earlier rounds; sets the place in the data and in the learning-rate schedule.
+        total_steps: length of the schedule; default `start_step + steps`.
+        checkpoint_dir: where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end.
+        resume: continue from the newest checkpoint in `checkpoint_dir`; the result is bit for bit the same.
+        loss: what to minimise; default the policy's own flow-matching loss.
+        correction: changes each gradient before it is clipped: FedProx, SCAFFOLD.
+        moments: the optimiser's state to go on from, as an earlier result has it; ``{}`` starts afresh and still
+            returns the state, None does neither.
+
+    Raises:
+        FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
+    """
+    torch.set_num_threads(granted_threads(config))
+    started = time.perf_counter()
+    with _seeded(batches.seed, start_step):
+        optimizer, scheduler = _optimizer(bundle, config, start_step, total_steps or start_step + steps)
+        _load_moments(bundle, optimizer, moments or {})
+        losses = _restore(bundle, optimizer, scheduler, checkpoint_dir) if resume else []
+        bundle.policy.train()
+        bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
+        for step in bar:
+            value = (loss or flow_loss)(bundle, batches.at(start_step + step))
+            losses.append(_step(bundle, value, optimizer, scheduler, correction))
+            if not np.isfinite(losses[-1]):
+                raise FloatingPointError(f"loss is {losses[-1]} at step {start_step + step}: lower lr={config.lr}")
+            bar.set_postfix(loss=f"{losses[-1]:.3f}")
+            if checkpoint_dir and _is_due(step + 1, steps, config.checkpoint_every):
+                _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoint_dir))
+        bundle.policy.eval()
+        after = {} if moments is None else _moments(bundle, optimizer)
+    return TrainResult(losses, batches.num_examples, len(losses), time.perf_counter() - started, after)
+
+
+def _step(
+    bundle: Bundle,
+    loss: torch.Tensor,
+    optimizer: torch.optim.Optimizer,
+    scheduler: Any,
+    correction: Correction | None = None,
+) -> float:
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    if correction:
+        correction(trainable(bundle.policy))
+    torch.nn.utils.clip_grad_norm_(trainable(bundle.policy).values(), bundle.policy.config.optimizer_grad_clip_norm)
+    optimizer.step()
+    scheduler.step()
+    return loss.item()
+
+
+def flow_loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
+    """The policy's own loss, or the same from a stored prefix; noise and time are drawn alike in both."""
+    if PREFIX_KEY not in batch:
+        return bundle.policy.forward(bundle.preprocess(batch))[0]
+    model, settings = bundle.policy.model, bundle.policy.config
+    shape = (len(batch["task"]), settings.chunk_size, settings.max_action_dim)
+    noise = model.sample_noise(shape, settings.device)
+    return prefix_loss(bundle, batch, noise, model.sample_time(shape[0], settings.device))
+
+
+def _moments(bundle: Bundle, optimizer: torch.optim.Optimizer) -> Arrays:
+    """Copies of the optimiser's tensors, named ``<parameter>|<exp_avg, exp_avg_sq or step>``."""
+    return {
+        f"{name}|{kind}": value.detach().cpu().numpy().copy()
+        for name, parameter in trainable(bundle.policy).items()
+        for kind, value in optimizer.state.get(parameter, {}).items()
+    }
+
+
+def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arrays) -> None:
+    """Put the optimiser where `_moments` found it."""
+    named = trainable(bundle.policy)
+    for key, value in moments.items():
+        name, kind = key.rsplit("|", 1)
+        device = "cpu" if kind == "step" else named[name].device  # PyTorch keeps the count of steps on the CPU
+        optimizer.state[named[name]][kind] = torch.from_numpy(value.copy()).to(device)
+
+
+def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
+    """SmolVLA's AdamW and cosine-with-warm-up presets, at the run's rate and length, standing at `start_step`."""
+    settings = bundle.policy.config
+    optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
+    floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of last to peak rate
+    preset = replace(
+        settings.get_scheduler_preset(),
+        peak_lr=config.lr,
+        decay_lr=floor,
+        num_warmup_steps=config.warmup_steps,
+        num_decay_steps=total_steps,
+    )
+    scheduler = preset.build(optimizer, total_steps)
+    scheduler.last_epoch = start_step
+    for group in optimizer.param_groups:
+        group["lr"] = config.lr * scheduler.lr_lambdas[0](start_step)
+    return optimizer, scheduler
+
+
+def learning_rates(bundle: Bundle, config: Config, *, steps: int) -> list[float]:
+    """Return the learning rate of each step of a training of `steps` steps."""
+    _, scheduler = _optimizer(bundle, config, 0, steps)
+    return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
+
+
+@contextmanager
+def _seeded(seed: int, start_step: int) -> Iterator[None]:
+    """Draw noise and flow time from (seed, start_step) and leave the caller's random state as it was."""
+    before = get_rng_state()
+    set_seed(int(np.random.SeedSequence([seed, start_step]).generate_state(1)[0]))
+    try:
+        yield
+    finally:
+        set_rng_state(before)
+
+
+def _is_due(done: int, steps: int, every: int) -> bool:
+    return done == steps or (every > 0 and done % every == 0)
+
+
+def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[float], folder: Path) -> None:
+    """Write ``step_NNNNNN`` whole or not at all: weights, optimiser, schedule, random state, losses."""
+    target = folder / f"step_{len(losses):06d}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch, safetensors_errors_named(target):
+        made = Path(scratch) / "checkpoint"
+        save_training_state(made, len(losses), optimizer, scheduler)
+        weights = {name: p.detach().contiguous() for name, p in trainable(bundle.policy).items()}
+        save_file(weights, made / WEIGHTS_FILE)
+        (made / LOSSES_FILE).write_text(json.dumps(losses))
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(made, target)
+
+
+def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, folder: Path | None) -> list[float]:
+    """Load the newest checkpoint in place and return the losses so far; an empty list when there is none."""
+    found = sorted(Path(folder).glob("step_*")) if folder else []
+    if not found:
+        return []
+    load_training_state(found[-1], optimizer, scheduler)
+    saved = load_file(found[-1] / WEIGHTS_FILE)
+    own = trainable(bundle.policy)
+    if set(saved) != set(own):
+        raise ValueError(f"{found[-1]} holds {len(saved)} trainable arrays, the policy has {len(own)}: another setup")
+    with torch.no_grad():
+        for name, parameter in own.items():
+            parameter.copy_(saved[name])
+    return json.loads((found[-1] / LOSSES_FILE).read_text())
+
+
+def with_gradient(parameters: Parameters, known: Container[str]) -> list[tuple[str, torch.nn.Parameter]]:
+    """Parameters to correct: not those that a backward pass did not reach, nor those that stay with the client."""
+    return [(name, p) for name, p in parameters.items() if p.grad is not None and name in known]

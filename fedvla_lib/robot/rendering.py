@@ -1,0 +1,81 @@
+"""Off-screen rendering that survives several environments in one process, and projection into a camera's image."""
+
+import atexit
+import gc
+import os
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+import numpy as np
+
+
+class SceneRenderer(mujoco.Renderer):
+    """A renderer whose end does not harm the others of the process.
+
+    MuJoCo frees a renderer's buffers in whichever OpenGL context is current. Buffers are numbered per context, so
+    freeing them in another renderer's context deletes that one's buffers, and it goes on to return garbage.
+    """
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
+        super().__init__(model, height, width)
+        self._view, self._options = mujoco.MjvCamera(), mujoco.MjvOption()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        # At exit MuJoCo ends its OpenGL display before Python destroys what still uses it.
+        atexit.register(_close, weakref.ref(self))
+
+    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> np.ndarray:
+        """Return the picture, uint8 (height, width, 3); `model` has the meshes of the one this was opened with."""
+        self._view.fixedcamid = model.camera(camera).id
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._options, None, self._view, everything, self.scene)
+        with garbage_collection_paused():
+            return self.render()
+
+    def close(self) -> None:
+        if self._gl_context:
+            self._gl_context.make_current()
+        super().close()
+
+
+@contextmanager
+def garbage_collection_paused() -> Iterator[None]:
+    """Put off Python's garbage collection: the end of another renderer would take away the context that is drawn in."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def open_renderer(model: mujoco.MjModel, image_size: int) -> SceneRenderer:
+    try:
+        return SceneRenderer(model, image_size, image_size)
+    except (mujoco.FatalError, RuntimeError, AttributeError) as error:  # by driver: MuJoCo has no common error
+        chosen = os.environ.get("MUJOCO_GL", "")
+        raise RuntimeError(
+            f"cannot draw off screen with MUJOCO_GL={chosen!r} ({error}): set MUJOCO_GL to egl, osmesa or glfw "
+            "before mujoco is first imported, or import fedvla_lib.robot.sim before it"
+        ) from error
+
+
+def _close(reference: "weakref.ref[SceneRenderer]") -> None:
+    renderer = reference()
+    if renderer is not None:
+        renderer.close()
+
+
+def project(model: mujoco.MjModel, data: mujoco.MjData, camera: str, points_m: np.ndarray) -> np.ndarray:
+    """Where points of the world frame, float64 (n, 3), appear in a camera's picture.
+
+    Returns:
+        float64 (n, 2): distance from the left and from the top edge, as shares of the side of the square picture;
+        outside [0, 1] for what the camera does not see. A pinhole: share = 1/2 + x / (2 z tan(fov / 2)).
+    """
+    view, angle_rad = data.camera(camera), np.deg2rad(model.camera(camera).fovy[0])
+    right, up, back = ((points_m - view.xpos) @ view.xmat.reshape(3, 3)).T  # the camera looks along minus its z axis
+    scale = 1 / (2 * np.tan(angle_rad / 2))
+    return np.column_stack([0.5 - scale * right / back, 0.5 + scale * up / back])
