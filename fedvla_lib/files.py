@@ -3,21 +3,13 @@
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-
-
-@contextmanager
-def safetensors_errors_named(path: Path) -> Iterator[None]:
-    """Make of the error of safetensors at a full disk, which is no OSError, one that names the file to be written."""
-    try:
-        yield
-    except SafetensorError as error:
-        raise OSError(f"cannot write {path}: {error}") from error
 
 
 def cache_dir() -> Path:
@@ -31,10 +23,50 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file beside its place and move it there."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
+    """Write a file, whole or not at all."""
+    with new_file(path) as draft:
+        draft.write_bytes(content)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yield a place beside `path` to write to; what is there when the block ends without an error moves to `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{os.getpid()}.{path.name}")  # the suffix stays: NumPy would add its own
+    try:
+        yield draft
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Yield an empty folder beside `folder`; it moves there when the block ends without an error.
+
+    Args:
+        replace: whether a folder that is there by then gives way. If not it stays: another process was faster.
+
+    Raises:
+        OSError: safetensors could not write, for which it has an error of its own; the message names `folder`.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = folder.with_name(f".{os.getpid()}.{folder.name}")
+    shutil.rmtree(draft, ignore_errors=True)  # left by a process of this number that was killed
+    draft.mkdir()
+    try:
+        yield draft
+        if replace:
+            shutil.rmtree(folder, ignore_errors=True)
+        try:
+            os.replace(draft, folder)
+        except OSError:
+            if not folder.is_dir():
+                raise
+    except SafetensorError as error:
+        raise OSError(f"cannot write {folder}: {error}") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def as_json(value: Any) -> Any:

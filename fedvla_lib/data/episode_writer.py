@@ -1,6 +1,5 @@
 """Writes episodes through LeRobot into a staging folder and publishes each one when its files are closed."""
 
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import DEFAULT_EPISODES_PATH, LeRobotDataset, aggregate_stats, write_stats
 from lerobot.utils.utils import SuppressProgressBars, unflatten_dict
 
+from fedvla_lib.files import new_file
 from fedvla_lib.robot.rollout import Episode
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY, image_key
 
@@ -148,7 +148,5 @@ def _copy_meta(root: Path, staging: Path, num_recorded: int) -> None:
 
 def _put(source: Path, target: Path) -> None:
     """Copy `source` to `target` so that `target` is never seen half written; LeRobot still needs `source`."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial")
-    shutil.copyfile(source, partial)
-    os.replace(partial, target)
+    with new_file(target) as draft:
+        shutil.copyfile(source, draft)

@@ -7,8 +7,6 @@ from then on only maps the files. This module does not know the format of a data
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +19,7 @@ from PIL import Image, ImageOps
 from tqdm.auto import tqdm
 
 from fedvla_lib.data.lerobot_reader import Source, locate, read_images, read_source
-from fedvla_lib.files import cache_dir
+from fedvla_lib.files import cache_dir, new_folder
 from fedvla_lib.robot.spec import JOINT_NAMES
 
 STORE_VERSION = 2  # part of every store's key: raise it when the files of a store change
@@ -81,29 +79,27 @@ def open_store(
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.with_suffix(".lock")):  # two processes that open the same data decode it once
             if not folder.is_dir():
-                _build(read_source(root, cameras), image_size, folder, progress)
+                source_read = read_source(root, cameras)
+                with new_folder(folder) as draft:
+                    _build(source_read, image_size, draft, progress)
     return _load(root, folder)
 
 
 def _build(source: Source, image_size: int, folder: Path, progress: bool) -> None:
-    """Write a store's files beside `folder` and rename them into place when they are complete."""
-    partial = folder.with_suffix(".partial")
-    shutil.rmtree(partial, ignore_errors=True)  # left by a build that was killed
-    partial.mkdir()
-    np.save(partial / "states.npy", source.states)
-    np.save(partial / "actions.npy", source.actions)
-    source.episodes.to_json(partial / "episodes.json", orient="records", indent=1)
-    (partial / "store.json").write_text(json.dumps({"fps": source.info["fps"], "cameras": list(source.cameras)}))
+    """Write a store's files into `folder`."""
+    np.save(folder / "states.npy", source.states)
+    np.save(folder / "actions.npy", source.actions)
+    source.episodes.to_json(folder / "episodes.json", orient="records", indent=1)
+    (folder / "store.json").write_text(json.dumps({"fps": source.info["fps"], "cameras": list(source.cameras)}))
     total = len(source.states) * len(source.cameras)
     with tqdm(total=total, desc="decoding frames", unit="frame", disable=not progress, leave=False) as bar:
         for camera, key in source.cameras.items():
             shape = (len(source.states), image_size, image_size, 3)
-            out = np.lib.format.open_memmap(partial / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
-            for row, picture in read_images(source, key):
-                out[row] = fit_square(picture, image_size)
+            out = np.lib.format.open_memmap(folder / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
+            for row, image in read_images(source, key):
+                out[row] = fit_square(image, image_size)
                 bar.update()
             out.flush()
-    os.replace(partial, folder)
 
 
 def _load(root: Path, folder: Path) -> FrameStore:

@@ -9,7 +9,6 @@ nothing about training.
 """
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from filelock import FileLock
 from tqdm.auto import tqdm
 
 from fedvla_lib.data.episode_writer import INFO_FILE, LOCK, SETTINGS_FILE, STAGING, EpisodeWriter
+from fedvla_lib.files import write_json
 from fedvla_lib.robot.expert import Expert
 from fedvla_lib.robot.labs import labs
 from fedvla_lib.robot.rollout import Episode, run_episode
@@ -141,7 +141,7 @@ def _num_recorded(root: Path) -> int:
 
 def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: bool) -> None:
     """Record the episodes that `root` lacks; whatever ends this leaves complete episodes only."""
-    _write_json(root / SETTINGS_FILE, settings)
+    write_json(root / SETTINGS_FILE, settings)
     done = _num_recorded(root)
     size, jitter = settings["image_size"], settings["jitter"]
     envs = {task: So100Env(task, size, jitter=jitter) for task in dict.fromkeys(settings["tasks"])}
@@ -164,10 +164,3 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
         recorder.close()
         for env in envs.values():
             env.close()
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(partial, path)

@@ -1,7 +1,6 @@
 """Rollouts as mp4 videos with their trajectories, and videos read back."""
 
 import io
-import os
 import tempfile
 from datetime import datetime
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
+from fedvla_lib.files import write_atomically
 from fedvla_lib.robot.rollout import Episode
 from fedvla_lib.robot.spec import CAMERAS, FPS
 
@@ -19,10 +19,10 @@ def save_rollout(episode: Episode, folder: Path) -> Path:
     """Write video and trajectory of a rollout and return the video's path; existing files are never overwritten."""
     stamp = datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     path = folder / f"rollout_{stamp}_{episode.task}_{episode.seed}.mp4"
-    _write(path, encode_video(side_by_side(episode)))
+    write_atomically(path, encode_video(side_by_side(episode)))
     trajectory = io.BytesIO()
     np.savez(trajectory, states=episode.states, actions=episode.actions, success=episode.success, seed=episode.seed)
-    _write(path.with_suffix(".npz"), trajectory.getvalue())
+    write_atomically(path.with_suffix(".npz"), trajectory.getvalue())
     return path
 
 
@@ -67,10 +67,3 @@ def read_video(path: Path) -> np.ndarray:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
     except (av.FFmpegError, ValueError, OSError, IndexError) as error:  # IndexError: no stream of pictures
         raise ValueError(f"{path} is not a readable video: {error}") from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.part")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)

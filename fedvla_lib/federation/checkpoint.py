@@ -11,7 +11,6 @@ Each file carries the SHA-256 of its arrays: safetensors itself notices a file t
 """
 
 import logging
-import os
 import re
 import shutil
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from fedvla_lib.files import safetensors_errors_named
+from fedvla_lib.files import new_folder
 from fedvla_lib.policy.parameters import Arrays, ParameterError, check_digest, digest
 
 logger = logging.getLogger(__name__)
@@ -45,21 +44,13 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint into the run folder, whole or not at all, and remove those before the last two.
 
     Raises:
-        OSError: it cannot be written; the message names the file.
+        OSError: it cannot be written; the message names the checkpoint's folder.
     """
     folder = root / "checkpoints" / f"round_{checkpoint.round}"
-    scratch = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(scratch, ignore_errors=True)
-    try:
-        scratch.mkdir(parents=True)
+    with new_folder(folder, replace=True) as draft:
         for part in PARTS:
-            with safetensors_errors_named(folder / f"{part}.safetensors"):
-                arrays = getattr(checkpoint, part)
-                save_file(arrays, scratch / f"{part}.safetensors", metadata={HASH: digest(arrays)})
-        shutil.rmtree(folder, ignore_errors=True)
-        os.replace(scratch, folder)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+            arrays = getattr(checkpoint, part)
+            save_file(arrays, draft / f"{part}.safetensors", metadata={HASH: digest(arrays)})
     for old in sorted(_rounds(root))[:-KEPT]:
         shutil.rmtree(root / "checkpoints" / f"round_{old}")
 

@@ -7,9 +7,7 @@ folder, or a hub id such as ``lerobot/smolvla_base``.
 
 import contextlib
 import io
-import os
 import shutil
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from safetensors import safe_open
 
 from fedvla_lib.config import Config, granted_threads, personal_parts
 from fedvla_lib.data.normalisation import Stats
-from fedvla_lib.files import cache_dir, safetensors_errors_named
+from fedvla_lib.files import cache_dir, new_folder
 from fedvla_lib.policy.lora import add_adapters, merged
 from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
@@ -122,16 +120,17 @@ def save_policy(bundle: Bundle, folder: Path) -> None:
     folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists already: a saved policy is never overwritten")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".saving-") as scratch, safetensors_errors_named(folder):
-        target = Path(scratch) / "policy"
-        merged(bundle.policy).save_pretrained(target)
-        bundle.preprocess.save_pretrained(target)
-        bundle.postprocess.save_pretrained(target)
-        backbone = Path(bundle.policy.config.vlm_model_name)
-        if backbone.is_dir():
-            shutil.copytree(backbone, target / VLM_FOLDER)
-        os.replace(target, folder)
+    with new_folder(folder) as draft:
+        write_policy(bundle, draft)
+
+
+def write_policy(bundle: Bundle, folder: Path) -> None:
+    """Write the files of a ``pretrained_model`` folder into `folder`, which somebody else publishes."""
+    for part in (merged(bundle.policy), bundle.preprocess, bundle.postprocess):
+        part.save_pretrained(folder)
+    backbone = Path(bundle.policy.config.vlm_model_name)
+    if backbone.is_dir():
+        shutil.copytree(backbone, folder / VLM_FOLDER)
 
 
 def _random_nano(config: Config) -> SmolVLAPolicy:

@@ -7,9 +7,6 @@ language model.
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -18,6 +15,8 @@ from urllib.request import url2pathname
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
 from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
 from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+
+from fedvla_lib.files import new_folder
 
 PACKAGE = "fedvla-lib"
 NANO, NANO_RANDOM = "nano", "nano-random"  # names of a base
@@ -55,10 +54,8 @@ def ensure_nano(cache: Path, image_size: int) -> Path:
     """
     folder = cache / f"nano-vlm-{image_size}"
     if not (folder / "config.json").exists():
-        cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache) as scratch:
-            write_nano(Path(scratch) / "vlm", image_size)
-            _publish(Path(scratch) / "vlm", folder)
+        with new_folder(folder) as draft:
+            write_nano(draft, image_size)
     return folder
 
 
@@ -130,16 +127,6 @@ def _tokenizer() -> PreTrainedTokenizerFast:
             "end_of_utterance_token": "<end_of_utterance>",
         },
     )
-
-
-def _publish(source: Path, target: Path) -> None:
-    """Move a finished folder into place; when another process was faster, keep its copy."""
-    try:
-        os.replace(source, target)
-    except OSError:
-        if not target.exists():
-            raise
-        shutil.rmtree(source)
 
 
 def nano_base() -> Path:

