@@ -138,7 +138,7 @@ def measure(settings: dict, profile: str) -> dict[str, float]:
 
 def round_seconds(run: Path) -> list[float]:
     """Return how long each round took, from the end of the one before to its own."""
-    events = read_events(run / "metrics.jsonl")
+    events = read_events(run)
     measured = [event for event in events if (event["who"], event["kind"]) == (GLOBAL, "evaluate")]
     ends = [datetime.fromisoformat(event["time"]) for event in measured]
     return [(end - begin).total_seconds() for begin, end in zip(ends, ends[1:], strict=False)]

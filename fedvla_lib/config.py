@@ -1,7 +1,7 @@
-"""Every setting of a run in one frozen dataclass, its three profiles, and the only parser of run settings.
+"""All settings of a run in one frozen dataclass, its three profiles, and the only parser of run settings.
 
 The same names, written with dashes, are the keys of ``[tool.flwr.app.config]`` in pyproject.toml and of
-``flwr run --run-config``. A profile is a set of numbers, never a branch in the code.
+``flwr run --run-config``. A profile is a set of values; the code never branches on its name.
 """
 
 import os
@@ -12,62 +12,62 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of a run; a default is the laptop profile's value."""
+    """Settings of a run; the defaults are the laptop profile. Each comment is the help text of a flag."""
 
     # data
-    data: str = ""  # LeRobot data set: a local folder or a hub id; empty records in simulation and caches
-    tasks: str = "lift,place,push"  # task mix, comma separated; a client's rollouts use the tasks it holds
+    data: str = ""  # LeRobot data set: a local folder or a hub id; empty records demonstrations and caches them
+    tasks: str = "lift,place,push"  # task names, comma separated; a client is evaluated on the tasks in its own data
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
-    image_size: int = 96  # side of the square camera images in pixels
-    num_labs: int = 1  # laboratories the demonstrations come from: cameras, light, colours and calibration differ
-    val_fraction: float = 0.1  # share of episodes held out for validation, per task
-    normalisation: str = "pooled"  # statistics of joints: pooled; or a mistake to measure: own, held-out, none
-    augment: bool = False  # jitter training images; off, a frozen model's view of a frame is computed once and kept
+    image_size: int = 96  # side length of the square camera images, in pixels
+    num_labs: int = 1  # labs that record demonstrations; each has its own cameras, light, colours and calibration
+    val_fraction: float = 0.1  # fraction of each task's episodes held out for validation
+    normalisation: str = "pooled"  # joint statistics: pooled, or a mistake to measure: own, held-out, none
+    augment: bool = False  # augment training images; if off, the prefix of a frozen model is cached for each frame
     # federation
-    num_clients: int = 10  # clients the episodes are partitioned over
-    partition: str = "modulo"  # modulo, task, dirichlet or lab
-    dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small means one task per client
-    num_server_rounds: int = 10  # rounds of federated averaging
-    fraction_train: float = 0.4  # share of clients that train in a round
-    fraction_evaluate: float = 1.0  # share of clients that evaluate in a round
-    min_replies: int = 1  # good training replies a round needs, else the run stops
-    round_timeout_s: float = 14400.0  # seconds a round waits for its clients; who has not answered by then is left out
+    num_clients: int = 10  # clients that the episodes are partitioned over
+    partition: str = "modulo"  # how episodes are partitioned: modulo, task, dirichlet or lab
+    dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small values give a client few tasks
+    num_server_rounds: int = 10  # federated rounds
+    fraction_train: float = 0.4  # fraction of clients that train in each round
+    fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
+    min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
+    round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian, krum or scaffold
-    server_lr: float = 0.0  # step size of the server in fedavgm, fedadam and fedyogi; 0 takes the strategy's default
-    server_momentum: float = 0.5  # fedavgm: share of the last server step that goes on; at 0.9 steps grow tenfold
-    clip_norm: float = 0.0  # longest movement of a client in a round that counts whole; 0 counts all whole
-    num_malicious: int = 1  # krum: clients drawn for a round that may send anything
-    personal: str = ""  # parts of the model that stay with each client, comma separated: projections, expert layer N
-    exchange: str = "float32"  # bits that travel: float32, float16, or int8 (float16 on the way down)
-    proximal_mu: float = 0.1  # fedprox: weight of the pull towards the global model
+    server_lr: float = 0.0  # server learning rate of fedavgm, fedadam and fedyogi; 0 uses the strategy's default
+    server_momentum: float = 0.5  # fedavgm: server momentum coefficient m; steady updates grow by 1 / (1 - m)
+    clip_norm: float = 0.0  # maximum L2 norm of a client's update; 0 does not clip
+    num_malicious: int = 1  # krum: Byzantine clients tolerated per round
+    personal: str = ""  # model parts that stay on each client, comma separated: projections, expert layer N
+    exchange: str = "float32"  # format of exchanged weights: float32, float16, or int8 (float16 from server to clients)
+    proximal_mu: float = 0.1  # fedprox: weight of the proximal term
     # model
-    base: str = "nano"  # 'nano' (pretrained, in this package), 'nano-random', a local folder or a hub id
-    chunk_size: int = 16  # future actions predicted at once; 50 in smolvla_base
-    n_action_steps: int = 8  # actions of a chunk carried out before the model looks again
-    freeze_vision_encoder: bool = True  # keep the vision encoder fixed
-    train_expert_only: bool = True  # keep the whole vision-language model fixed, train expert and projections
-    lora_rank: int = 0  # rank of adapters that train instead of the expert's weights; 0 trains the weights themselves
-    lora_freeze_a: bool = False  # train only one of the two adapter matrices, which makes their average exact
-    train_state_proj: bool = False  # also train the projection of the arm's state into the prefix
+    base: str = "nano"  # base model: nano (pretrained, in this package), nano-random, a local folder or a hub id
+    chunk_size: int = 16  # actions predicted per chunk; smolvla_base uses 50
+    n_action_steps: int = 8  # actions of a chunk that are executed before the next observation
+    freeze_vision_encoder: bool = True  # freeze the vision encoder
+    train_expert_only: bool = True  # freeze the vision-language model; train the action expert and projections only
+    lora_rank: int = 0  # rank of LoRA adapters that train in place of the expert's weights; 0 trains the weights
+    lora_freeze_a: bool = False  # train only the B matrices of the adapters, which makes averaging them exact
+    train_state_proj: bool = False  # also train the projection of the joint state into the prefix
     # local training
-    local_steps: int = 20  # optimiser steps of a client in a round
-    batch_size: int = 32  # samples per optimiser step
+    local_steps: int = 20  # gradient steps of a client in each round
+    batch_size: int = 32  # samples per gradient step
     lr: float = 1e-3  # peak learning rate of AdamW; smolvla_base uses 1e-4
-    keep_optimizer: bool = False  # a client's optimiser goes on in its next round instead of starting afresh
-    warmup_steps: int = 20  # linear warm-up of the learning rate, in steps
-    checkpoint_every: int = 200  # steps between checkpoints of local training; 0 keeps only the last
+    keep_optimizer: bool = False  # keep a client's optimiser state from round to round
+    warmup_steps: int = 20  # gradient steps of linear learning rate warm-up
+    checkpoint_every: int = 200  # gradient steps between checkpoints of local training; 0 keeps only the last
     # evaluation
-    validate_every: int = 1  # rounds between global models that are kept and measured on held-out episodes
+    validate_every: int = 1  # rounds between saved global models, each evaluated on the held-out episodes
     eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
-    eval_rollouts: int = 4  # rollouts per task of the global model at each evaluation
+    eval_rollouts: int = 4  # rollouts per task at each evaluation of the global model
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
-    action_tolerance_deg: float = 5.0  # a predicted joint target within this of the demonstration counts as accurate
+    action_tolerance_deg: float = 5.0  # maximum error, in degrees, of a predicted joint target that counts as accurate
     # run
-    seed: int = 0  # fixes data order, initial weights, noise, client sampling and rollouts
-    device: str = "cpu"  # torch device: cpu, cuda or mps; cpu gives way where Flower reserves a card for a client
-    num_threads: int = 0  # torch threads; 0 takes the cores granted to this process
-    out: str = "outputs"  # where run folders are made
-    resume: str = ""  # run folder of an interrupted run to go on with; empty starts a new one
+    seed: int = 0  # seed of data order, initial weights, noise, client sampling and rollouts
+    device: str = "cpu"  # torch device: cpu, cuda or mps; cpu becomes cuda where Flower reserves a GPU for a client
+    num_threads: int = 0  # torch threads; 0 uses all cores granted to this process
+    out: str = "outputs"  # parent folder of the run folders
+    resume: str = ""  # run folder of an interrupted run to resume; empty starts a new run
 
 
 PROFILES: dict[str, dict[str, Any]] = {
@@ -83,7 +83,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "eval_every": 0,
         "eval_rollouts": 1,
         "checkpoint_every": 2,
-        "num_threads": 1,  # for work this small a second thread costs more than it brings
+        "num_threads": 1,  # a second thread costs more than it gains on so little work
     },
     "laptop": {},
     "gpu": {
@@ -111,20 +111,20 @@ STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian",
 
 
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
-    """Return the settings of profile `name` (default: ``$FEDVLA_PROFILE``, else laptop) with `overrides` on top.
+    """Return the settings of profile `name` (default: ``$FEDVLA_PROFILE``, else laptop), updated with `overrides`.
 
     Raises:
-        ValueError: unknown profile or setting, or a value out of range; the message lists the valid ones.
+        ValueError: unknown profile or setting, or value out of range; the message lists the valid ones.
     """
     name = name or os.environ.get("FEDVLA_PROFILE", "laptop")
     if name not in PROFILES:
         raise ValueError(f"unknown profile {name!r}: choose one of {', '.join(PROFILES)}")
-    return check(replace(Config(), **{**PROFILES[name], **_known(overrides)}))
+    return check(replace(Config(), **{**PROFILES[name], **_require_known(overrides)}))
 
 
 def from_run_config(run_config: dict[str, Any]) -> Config:
     """Parse Flower's run config, whose keys are the field names with dashes (``num-server-rounds``)."""
-    values = _known({key.replace("-", "_"): value for key, value in run_config.items()})
+    values = _require_known({key.replace("-", "_"): value for key, value in run_config.items()})
     types = {field.name: field.type for field in fields(Config)}
     return check(Config(**{key: _cast(key, value, types[key]) for key, value in values.items()}))
 
@@ -135,23 +135,31 @@ def to_run_config(config: Config) -> dict[str, Any]:
 
 
 def task_names(config: Config) -> list[str]:
-    """Return the tasks of the mix as a list."""
-    return [name.strip() for name in config.tasks.split(",") if name.strip()]
+    """Return `config.tasks` as a list."""
+    return _split(config.tasks)
 
 
 def personal_parts(config: Config) -> list[str]:
-    """Return the parts of the model that stay with each client as a list."""
-    return [name.strip() for name in config.personal.split(",") if name.strip()]
+    """Return `config.personal` as a list."""
+    return _split(config.personal)
+
+
+def _split(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def granted_cores() -> int:
+    """Return the number of CPU cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def granted_threads(config: Config) -> int:
-    """Return the torch threads to use: `num_threads`, or the cores this process may run on."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return config.num_threads or cores
+    """Return the number of torch threads to use: `config.num_threads`, or all granted cores if that is 0."""
+    return config.num_threads or granted_cores()
 
 
 def check(config: Config) -> Config:
-    """Return `config` if every value is usable, else raise ValueError naming the setting, the value and the range."""
+    """Return `config`, or raise ValueError with the setting, its value and the valid range if a value is unusable."""
     positive = (
         "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
         "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
@@ -159,21 +167,20 @@ def check(config: Config) -> Config:
     )  # fmt: skip
     for name in positive:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
-    countable = (
+    non_negative = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
         "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious",
     )  # fmt: skip
-    for name in countable:
+    for name in non_negative:
         _require(getattr(config, name) >= 0, config, name, "0 or more")
     for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum"):
-        _require(0 <= getattr(config, name) <= 1, config, name, "a share from 0 to 1")
-    _require(config.fraction_train > 0, config, "fraction_train", "a share above 0")
-    _require(config.partition in PARTITIONS, config, "partition", f"one of {', '.join(PARTITIONS)}")
-    _require(config.normalisation in NORMALISATIONS, config, "normalisation", f"one of {', '.join(NORMALISATIONS)}")
-    _require(config.strategy in STRATEGIES, config, "strategy", f"one of {', '.join(STRATEGIES)}")
-    _require(config.exchange in EXCHANGES, config, "exchange", f"one of {', '.join(EXCHANGES)}")
-    most = f"at most chunk_size={config.chunk_size}"
-    _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", most)
+        _require(0 <= getattr(config, name) <= 1, config, name, "a number from 0 to 1")
+    _require(config.fraction_train > 0, config, "fraction_train", "a number above 0")
+    choices = {"partition": PARTITIONS, "normalisation": NORMALISATIONS, "strategy": STRATEGIES, "exchange": EXCHANGES}
+    for name, valid in choices.items():
+        _require(getattr(config, name) in valid, config, name, f"one of {', '.join(valid)}")
+    limit = f"at most chunk_size={config.chunk_size}"
+    _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", limit)
     _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")
     return config
 
@@ -183,7 +190,7 @@ def _require(ok: bool, config: Config, name: str, valid: str) -> None:
         raise ValueError(f"{name.replace('_', '-')}={getattr(config, name)!r} is not usable: give {valid}")
 
 
-def _known(values: dict[str, Any]) -> dict[str, Any]:
+def _require_known(values: dict[str, Any]) -> dict[str, Any]:
     names = [field.name for field in fields(Config)]
     for key in values:
         if key not in names:
@@ -192,7 +199,7 @@ def _known(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cast(key: str, value: Any, kind: type) -> Any:
-    """Flower parses ``lr=1`` as an int; accept that, but no string where a number belongs."""
+    """Return `value` as `kind`: Flower parses ``lr=1`` as an int, which is accepted; a string for a number is not."""
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not kind:
@@ -201,7 +208,7 @@ def _cast(key: str, value: Any, kind: type) -> Any:
 
 
 def absolute(config: Config) -> Config:
-    """Return settings with absolute paths: Flower's processes choose their own working directory. Hub ids stay."""
+    """Make local paths absolute, since Flower's processes choose their own working directory. Hub ids stay."""
     paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
-    found = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
-    return replace(config, out=str(Path(config.out).resolve()), **found)
+    local = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
+    return replace(config, out=str(Path(config.out).resolve()), **local)

@@ -1,4 +1,4 @@
-"""Where a result comes from: the code, settings, versions and hardware that made it."""
+"""Provenance of a result: digests of code and settings, and a stamp with commit, versions and hardware."""
 
 import ast
 import hashlib
@@ -15,6 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from fedvla_lib.config import Config
 
 PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
@@ -22,11 +24,11 @@ LIBRARY = Path(__file__).parent
 
 
 def code_digest(*functions: Callable[..., Any]) -> str:
-    """Return a short hash of what the code that these functions reach does.
+    """Return a short hash of what the code reached from `functions` does.
 
-    It covers every statement of every module of the library that theirs import, directly or through others. Imports,
-    comments and docstrings do not count, nor where a statement stands: code that only moves keeps its digest. What is
-    kept in the cache carries the digest in its name, so that results of older code do not pass for results of this.
+    It covers all statements of all library modules that the functions' modules import, directly or indirectly. Imports,
+    comments, docstrings and the place of a statement do not count, so moving code does not change it. Names of cached
+    results contain it, so that results of older code are not reused.
     """
     modules = {module for function in functions for module in reached_modules(function.__module__)}
     statements = sorted(statement for module in modules for statement in _statements(module))
@@ -35,12 +37,12 @@ def code_digest(*functions: Callable[..., Any]) -> str:
 
 @cache
 def reached_modules(module: str) -> frozenset[str]:
-    """Return a module of the library and all that it imports, at its top or inside functions, directly or not."""
-    found, todo = set(), {module}
+    """Return a library module and all library modules it imports, directly or indirectly, also inside functions."""
+    reached, todo = set(), {module}
     while todo:
-        found.add(name := todo.pop())
-        todo |= _imported(name) - found
-    return frozenset(found)
+        reached.add(name := todo.pop())
+        todo |= _imported(name) - reached
+    return frozenset(reached)
 
 
 def _tree(module: str) -> ast.Module:
@@ -53,7 +55,7 @@ def _file(module: str) -> Path:
 
 
 def _imported(module: str) -> set[str]:
-    """The library's modules that a module names in an import statement; the import of a package is one of these too."""
+    """The library modules and packages named in the import statements of `module`."""
     froms = [node for node in ast.walk(_tree(module)) if isinstance(node, ast.ImportFrom) and node.module]
     names = {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | {node.module for node in froms}
     return {name for name in names if name.startswith(f"{LIBRARY.name}.") and _file(name).is_file()}
@@ -61,12 +63,12 @@ def _imported(module: str) -> set[str]:
 
 @cache
 def _statements(module: str) -> tuple[str, ...]:
-    """The statements of a module as text that depends on what they do only."""
-    return tuple(ast.unparse(statement) for statement in _WithoutWords().visit(_tree(module)).body)
+    """The statements of a module as normalised source text."""
+    return tuple(ast.unparse(statement) for statement in _WithoutText().visit(_tree(module)).body)
 
 
-class _WithoutWords(ast.NodeTransformer):
-    """Drops what does not act: imports, docstrings and other bare texts. Comments are not in a tree at all."""
+class _WithoutText(ast.NodeTransformer):
+    """Removes imports, docstrings and other bare strings; the parser has already dropped the comments."""
 
     def visit_Import(self, node: ast.Import) -> None:
         return None
@@ -79,13 +81,13 @@ class _WithoutWords(ast.NodeTransformer):
 
 
 def config_hash(config: Config) -> str:
-    """Return a short hash of what a run computes: all settings except where it writes and how many threads it uses."""
+    """Return a short hash of the settings that decide a run's results: all but out, num_threads and resume."""
     settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def first_stamp(config: Config, engine: str) -> dict[str, Any]:
-    """Return what is known of a run when it starts: commit, settings, versions, hardware."""
+    """Return the stamp of a run that starts: commit, hash of the settings, versions, hardware."""
     return {
         "status": "running",
         "engine": engine,
@@ -104,7 +106,7 @@ def _version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
-        return None  # inside a Flower app bundle this library runs without being installed
+        return None  # in a Flower app bundle this library is not installed
 
 
 def _hardware(config: Config) -> dict[str, Any]:
@@ -113,25 +115,24 @@ def _hardware(config: Config) -> dict[str, Any]:
         "system": platform.system(),
         "cores": os.cpu_count(),
         "device": config.device,
-        "memory_gb": _memory_gb(),
+        "memory_gb": round(memory_gib(), 1),
     }
 
 
-def _memory_gb() -> float | None:
-    if not hasattr(os, "sysconf"):
-        return None
-    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+def memory_gib() -> float:
+    """Return the physical memory of this machine in GiB."""
+    return psutil.virtual_memory().total / 2**30
 
 
 def _commit() -> str | None:
-    """The commit of the checkout this library lies in, with + when tracked files differ; None outside a checkout."""
+    """The commit of this library's checkout, with + if tracked files were changed; None outside a checkout."""
     if shutil.which("git") is None:
         return None
-    here = Path(__file__).parent
     command = ["git", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
-    described = subprocess.run(command, cwd=here, capture_output=True, text=True)
+    described = subprocess.run(command, cwd=LIBRARY, capture_output=True, text=True)
     return described.stdout.strip() or None
 
 
 def now() -> str:
+    """Return the local time with its offset from UTC, in ISO 8601 format to the millisecond."""
     return datetime.now().astimezone().isoformat(timespec="milliseconds")

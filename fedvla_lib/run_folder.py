@@ -1,16 +1,16 @@
-"""A run on disk: settings, events, checkpoints, videos and a stamp, in one folder that is never overwritten.
+"""A run on disk: settings, events, models, videos and a stamp in one folder, which is never overwritten.
 
 ::
 
     outputs/20260131_142501/
       config.json                 every setting
-      metrics.jsonl               one event a line: round, who, kind, time, values
+      metrics.jsonl               one event per line: round, who, kind, time, values
       stamp.json                  commit, config hash, versions, hardware, status, wall time
       global_model/round_3/       LeRobot pretrained_model folder
       evaluate/round_3/client_1/  rollout_<timestamp>.mp4
 
-Whole files appear by rename, events by one append each, so a run that is killed leaves only complete things.
-Who writes to a run holds a lock in its folder, which the system releases however that process ends.
+Files are written atomically and each event is one append, so a killed run leaves no partial files. The process that
+writes to a run holds a lock file in its folder; the operating system releases the lock when the process ends.
 """
 
 import json
@@ -26,7 +26,6 @@ from typing import Any
 import pandas as pd
 from filelock import FileLock, Timeout
 
-from fedvla_lib import provenance
 from fedvla_lib.config import Config, check
 from fedvla_lib.files import as_json, write_atomically, write_json
 from fedvla_lib.provenance import config_hash, first_stamp, now
@@ -34,40 +33,41 @@ from fedvla_lib.provenance import config_hash, first_stamp, now
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
 GLOBAL = "global"
 LOCK = ".lock"
-PATIENCE_S = 1.0  # with a lock that another process may hold only to see whether it is free
+METRICS_FILE = "metrics.jsonl"
+LOCK_TIMEOUT_S = 1.0  # longer than another process holds the lock just to test it
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run that is being written; `run_folder.start` makes one."""
+    """A run that is being written; made by `start`."""
 
     root: Path
 
     def log(self, round_number: int, who: str, kind: str, values: dict[str, Any]) -> None:
-        """Append one event: `who` is ``global`` or a client's name, `kind` says what the values are."""
+        """Append an event of `kind`; `who` is ``global`` or ``client_K``."""
         event = {"round": round_number, "who": who, "kind": kind, "time": now(), "values": as_json(values)}
-        with open(self.root / "metrics.jsonl", "ab", buffering=0) as file:
+        with open(self.root / METRICS_FILE, "ab", buffering=0) as file:
             file.write((json.dumps(event, allow_nan=False) + "\n").encode())
 
     def model_dir(self, round_number: int) -> Path:
-        """Where the global model of a round belongs."""
+        """Return the folder of the global model of a round."""
         return self.root / "global_model" / f"round_{round_number}"
 
     def videos_dir(self, round_number: int, who: str) -> Path:
-        """Where the videos of `who` (``global`` or ``client_K``) in a round belong."""
+        """Return the folder of the videos of `who` (``global`` or ``client_K``) in a round."""
         return self.root / "evaluate" / f"round_{round_number}" / who
 
     def relative(self, path: str | Path | None) -> str | None:
-        """Return `path` as seen from the run folder, so that the folder can be moved; None stays None."""
+        """Return `path` relative to the run folder, so that the folder can be moved; None stays None."""
         return Path(path).relative_to(self.root).as_posix() if path else None
 
 
 @contextmanager
 def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
-    """Make ``<config.out>/<YYYYmmdd_HHMMSS>/``, or take ``config.resume``, yield it, and stamp how the run ended.
+    """Create ``<config.out>/<YYYYmmdd_HHMMSS>/`` or reopen ``config.resume``; stamp how the run ended on exit.
 
     Raises:
-        ValueError: the folder cannot be written, or what is to be resumed is no such run, or is still going on.
+        ValueError: the folder cannot be written, or the run to be resumed cannot be, or is still running.
     """
     began = time.perf_counter()
     root = _existing(Path(config.resume)) if config.resume else _make_folder(Path(config.out))
@@ -92,12 +92,12 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
 
 @contextmanager
 def hold(root: Path) -> Iterator[None]:
-    """Be the one process that writes to a run folder.
+    """Lock a run folder for writing.
 
     Raises:
-        ValueError: another one does.
+        ValueError: another process holds the lock.
     """
-    lock = FileLock(root / LOCK, timeout=PATIENCE_S)
+    lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S)
     try:
         lock.acquire()
     except Timeout as error:
@@ -109,20 +109,20 @@ def hold(root: Path) -> Iterator[None]:
 
 
 def is_held(root: Path) -> bool:
-    """Whether a process writes to a run, as far as can be seen: who may not write there cannot try the lock."""
-    if not (root / LOCK).is_file():  # of an older version, or never started
+    """Return whether a process writes to a run; assumed so where this process may not open the lock file."""
+    if not (root / LOCK).is_file():  # a run of an older version, or one that never started
         return False
     try:
-        with FileLock(root / LOCK, timeout=PATIENCE_S / 5):
+        with FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S / 5):
             return False
     except (Timeout, OSError):
         return True
 
 
 def forget_after(root: Path, round_number: int) -> None:
-    """Remove what a run has written of later rounds, which are about to be done again: events, models and videos."""
-    kept = [event for event in read_events(root / "metrics.jsonl") if event["round"] <= round_number]
-    write_atomically(root / "metrics.jsonl", b"".join((json.dumps(event) + "\n").encode() for event in kept))
+    """Delete the events, models and videos of rounds after `round_number`, which are about to be repeated."""
+    kept = [event for event in read_events(root) if event["round"] <= round_number]
+    write_atomically(root / METRICS_FILE, b"".join((json.dumps(event) + "\n").encode() for event in kept))
     for folder in [*root.glob("global_model/round_*"), *root.glob("evaluate/round_*")]:
         if int(folder.name.removeprefix("round_")) > round_number:
             shutil.rmtree(folder)
@@ -135,18 +135,18 @@ def _existing(root: Path) -> Path:
 
 
 def resumable(root: Path, config: Config) -> dict[str, Any]:
-    """Return the stamp of a run that these settings can go on with.
+    """Return the stamp of a run that can be resumed with these settings.
 
     Raises:
-        ValueError: no run, a completed one, or one with other settings.
+        ValueError: not a run folder, a completed run, or a run with other settings.
     """
-    stamp, theirs = read_stamp(_existing(root)), read_config(root)
+    stamp, saved = read_stamp(_existing(root)), read_config(root)
     if stamp["status"] == "completed":
-        raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to go on with")
-    if config_hash(theirs) != config_hash(config):
-        other = [name for name, value in asdict(theirs).items() if value != getattr(config, name)]
-        changed = sorted(set(other) - {"out", "num_threads", "resume"})
-        raise ValueError(f"resume={str(root)!r} was run with another {changed[0].replace('_', '-')}: its settings stay")
+        raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to resume")
+    if config_hash(saved) != config_hash(config):
+        other = {name for name, value in asdict(saved).items() if value != getattr(config, name)}
+        name = min(other - {"out", "num_threads", "resume"}).replace("_", "-")
+        raise ValueError(f"resume={str(root)!r} was run with another {name}: resume it with its own settings")
     return stamp
 
 
@@ -158,8 +158,7 @@ def read_config(root: Path) -> Config:
 def read_stamp(root: Path) -> dict[str, Any]:
     """Return the stamp of a run: commit, versions, hardware, status, wall time.
 
-    A process that was killed left ``running`` in the file. Where none writes to the run any more, that is returned as
-    ``interrupted``.
+    A killed process leaves ``running`` in the file; if no process writes to the run, the status is ``interrupted``.
     """
     stamp = json.loads((Path(root) / "stamp.json").read_text())
     if stamp.get("status") == "running" and not is_held(Path(root)):
@@ -168,26 +167,26 @@ def read_stamp(root: Path) -> dict[str, Any]:
 
 
 def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
-    """Return the events of a run, one row each: round, who, kind, time and a column per value.
+    """Return the events of a run, one row each: round, who, kind, time and one column per value.
 
     Args:
-        kind: only events of this kind, with only the columns they use: ``train``, ``evaluate``, ``rollout``,
+        kind: return only events of this kind, and only the columns they use: ``train``, ``evaluate``, ``rollout``,
             ``replies`` or ``rejected``.
 
     Raises:
-        ValueError: no run there, or a line of ``metrics.jsonl`` is not an event.
+        ValueError: not a run folder, or a line of ``metrics.jsonl`` is not an event.
     """
-    events = [event for event in read_events(Path(root) / "metrics.jsonl") if kind in (None, event["kind"])]
+    events = [event for event in read_events(root) if kind in (None, event["kind"])]
     fixed = ["round", "who", "kind", "time"]
     named = list(dict.fromkeys(key for event in events for key in event["values"] if key not in fixed))
     return pd.DataFrame([{**e["values"], **{key: e[key] for key in fixed}} for e in events], columns=fixed + named)
 
 
 def counted_steps(root: Path) -> dict[str, int] | None:
-    """Return the gradient steps behind a federated run's global model, as its clients counted them.
+    """Return the gradient steps that went into a federated run's global model, as counted by its clients.
 
-    ``in_all`` sums over all replies that were averaged; ``in_a_row`` over rounds, of each the client with the most,
-    since the clients of a round train side by side. None where a reply has no count: such a run is older than counting.
+    ``in_all`` sums over all averaged replies; ``in_a_row`` sums the largest count of each round, since the clients of a
+    round train in parallel. None for a run of an older version, whose replies lack counts.
     """
     trained = read_metrics(root, "train")
     if "steps" not in trained or trained.steps.isna().any():
@@ -196,29 +195,30 @@ def counted_steps(root: Path) -> dict[str, int] | None:
 
 
 def _make_folder(out: Path) -> Path:
-    """Two runs in one second get two names: the later takes the next free second."""
-    when = datetime.now()
+    """If two runs start in the same second, the later one gets the next free second as its name."""
+    named = datetime.now()
     while True:
-        path = out / when.strftime(STAMP_FORMAT)
+        path = out / named.strftime(STAMP_FORMAT)
         try:
             path.mkdir(parents=True)
             return path
         except FileExistsError:
-            when += timedelta(seconds=1)
+            named += timedelta(seconds=1)
         except OSError as error:
             message = f"cannot make the run folder {path} ({error.strerror}): give a writable folder as out"
             raise ValueError(message) from error
 
 
-def read_events(path: Path) -> list[dict[str, Any]]:
-    """Return the complete events of a ``metrics.jsonl``.
+def read_events(root: Path) -> list[dict[str, Any]]:
+    """Return the complete events of a run.
 
     Raises:
-        ValueError: no such file, or a line of it is not an event.
+        ValueError: not a run folder, or a line of ``metrics.jsonl`` is not an event.
     """
+    path = Path(root) / METRICS_FILE
     if not path.is_file():
-        raise ValueError(f"{path.parent} is not a run folder: it has no {path.name}")
-    lines = path.read_text().split("\n")[:-1]  # a line without its newline was cut off by a crash
+        raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")
+    lines = path.read_text().split("\n")[:-1]  # a last line without a newline was cut off by a crash
     return [_event(path, number, line) for number, line in enumerate(lines, start=1)]
 
 
@@ -230,16 +230,16 @@ def _event(path: Path, number: int, line: str) -> dict[str, Any]:
 
 
 def run_folders(config: Config) -> set[Path]:
-    """Return the run folders there are where `config` writes."""
+    """Return the existing run folders in `config.out`."""
     return {stamp.parent for stamp in Path(config.out).glob("*/stamp.json")}
 
 
 def own_run(config: Config, before: set[Path]) -> Path | None:
-    """Return the folder that a run writes: the one to be resumed, or the newest with its settings not in `before`.
+    """Return the folder of a run just started: the resumed one, or the newest with its settings not in `before`.
 
-    Others may write to the same place meanwhile. None: it has not begun.
+    Other runs may be writing to the same parent folder. None if the run has not started yet.
     """
     if config.resume:
         return Path(config.resume)
-    wanted, new = provenance.config_hash(config), run_folders(config) - before
-    return max((r for r in new if provenance.config_hash(read_config(r)) == wanted), default=None)
+    wanted, new = config_hash(config), run_folders(config) - before
+    return max((root for root in new if config_hash(read_config(root)) == wanted), default=None)

@@ -36,7 +36,7 @@ def copied(run, out, *, settings=None, kind="", name="", change=lambda value: va
     shutil.copytree(run, out)
     config = json.loads((out / "config.json").read_text()) | (settings or {})
     (out / "config.json").write_text(json.dumps(config))
-    events = run_folder.read_events(out / "metrics.jsonl")
+    events = run_folder.read_events(out)
     for event in events:
         if event["kind"] == kind:
             event["values"][name] = change(event["values"][name])

@@ -141,8 +141,8 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
     happened = []
 
     def meddle():
-        metrics = [folder / "metrics.jsonl" for folder in run_folder.run_folders(config)]
-        kinds = {e["kind"] for file in metrics if file.exists() for e in run_folder.read_events(file)}
+        begun = [folder for folder in run_folder.run_folders(config) if (folder / "metrics.jsonl").exists()]
+        kinds = {event["kind"] for folder in begun for event in run_folder.read_events(folder)}
         if "train" in kinds and not happened:
             standing.kill_node(1)
             happened.append("killed")

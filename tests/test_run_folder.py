@@ -102,7 +102,7 @@ with run_folder.start(from_profile("tiny", out=sys.argv[1]), engine="inline") as
 
 
 def test_a_run_is_going_on_as_long_as_its_process_lives(tmp_path):
-    """Nobody else may go on with it meanwhile; killed, it reads as interrupted, and may be gone on with."""
+    """No other process may resume it meanwhile; once killed, it reads as interrupted and may be resumed."""
     process = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     root = Path(process.stdout.readline().strip())
     config, stamp = from_profile("tiny", out=str(tmp_path), resume=str(root)), (root / "stamp.json").read_text()
@@ -112,7 +112,7 @@ def test_a_run_is_going_on_as_long_as_its_process_lives(tmp_path):
     assert (root / "stamp.json").read_text() == stamp
     process.kill()
     process.communicate()
-    assert (root / "stamp.json").read_text() == stamp  # nobody was left to say otherwise
+    assert (root / "stamp.json").read_text() == stamp  # no process was left to update it
     assert run_folder.read_stamp(root)["status"] == "interrupted"
     assert make(config) == root and run_folder.read_stamp(root)["status"] == "completed"
 
@@ -131,7 +131,7 @@ def test_an_unwritable_place_is_named(tmp_path):
 
 @contextlib.contextmanager
 def read_only(folder):
-    """Meanwhile nobody may write there: root, who may write everywhere, is another user for as long."""
+    """Make a folder read-only for the block; root, who may write anywhere, becomes another user meanwhile."""
     is_root, everything = os.geteuid() == 0, [folder, *folder.rglob("*")]
     for path in everything:
         path.chmod(0o555)
@@ -148,8 +148,8 @@ def read_only(folder):
 
 @pytest.mark.skipif(os.name != "posix", reason="sets POSIX permissions")
 def test_a_read_only_place_is_named_and_left_as_it_is(tmp_path, monkeypatch):
-    """A new run there, and one that is to go on. Its place is open to other users, which pytest's is not."""
-    monkeypatch.setenv("PATH", str(tmp_path))  # without git, which the other user may not ask about this checkout
+    """A new run and a resumed one, in a folder that other users can read, which pytest's is not."""
+    monkeypatch.setenv("PATH", str(tmp_path))  # no git: the other user may not read this checkout
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         config = from_profile("tiny", out=str(place / "outputs"))

@@ -1,8 +1,8 @@
-"""What this machine lacks to run the book, and how to mend it.
+"""Check whether this machine can run the book, and say how to fix what is missing.
 
-Every check is one function that returns one `Check`; none of them raises for what it looks for. Heavy packages are
-imported inside the checks (MuJoCo in a process of its own, because a wrong driver ends the process), so that the doctor
-still speaks when one of them is broken. The doctor does not know torch, LeRobot or Flower beyond their version numbers.
+Each check is one function that returns one `Check` and raises no error for the fault it looks for. Heavy packages are
+imported inside the checks (MuJoCo in a separate process, which a wrong driver kills), so that the doctor still runs
+when one of them is broken. It does not know torch, LeRobot or Flower beyond their version numbers.
 """
 
 import importlib.metadata
@@ -19,20 +19,21 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from fedvla_lib.config import granted_cores
 from fedvla_lib.files import cache_dir
 
 MIN_PYTHON = (3, 12)
-MIN_FREE_GIB = 2.0  # recordings, decoded frames, run folders and pages of all chapters at the laptop profile
-MIN_MEMORY_GIB = 4.0  # the largest chapter at the laptop profile, with a browser beside it
-RENDER_TIMEOUT_S = 120  # the first off-screen context of a cold machine takes tens of seconds
+MIN_FREE_GIB = 2.0  # recordings, decoded frames, run folders and pages of all chapters, laptop profile
+MIN_MEMORY_GIB = 4.0  # the largest chapter, laptop profile, and a browser
+RENDER_TIMEOUT_S = 120  # the first off-screen context after a boot takes tens of seconds
 HUB_TIMEOUT_S = 3.0
-CODECS = ("h264",)  # of the recorded camera streams and of the videos in the pages
-MAX_PIXEL_ERROR = 12.0  # mean absolute error of a decoded test frame, of 255; a lossy codec stays below 5
+CODECS = ("h264",)  # of recorded camera images and of the videos in the pages
+MAX_PIXEL_ERROR = 12.0  # mean absolute error of a decoded test frame, out of 255; H.264 stays below 5
 APT_RENDERING = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 
-# Draws a red box that fills the middle of the frame, then prints the mean colour of the centre and of a corner.
+# Renders a red box in the middle of the frame; prints the mean colour of the centre and of a corner.
 DRAW_A_FRAME = """
-import fedvla_lib.robot.scene  # picks the driver as the chapters do, before MuJoCo is loaded
+import fedvla_lib.robot.scene  # selects the driver as the chapters do, before MuJoCo is imported
 import mujoco
 model = mujoco.MjModel.from_xml_string('''
 <mujoco><worldbody><light pos="0 0 3"/><geom type="box" size=".2 .2 .2" rgba="1 0 0 1"/>
@@ -48,25 +49,25 @@ print(*frame[28:36, 28:36].mean((0, 1)), *frame[:4, :4].mean((0, 1)))
 
 @dataclass(frozen=True)
 class Check:
-    """The outcome of one check: what was looked at, what was found and, when it is not right, the exact mend."""
+    """Result of one check; `fix` is the command or action that corrects a failure."""
 
     name: str
     ok: bool
     found: str
-    mend: str = ""
-    required: bool = True  # without it a chapter cannot run; otherwise it is advice
+    fix: str = ""
+    required: bool = True  # a chapter cannot run without it; otherwise a failure is only a note
 
 
 def check_interpreter(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
-    """Check that the interpreter is one the packages support."""
+    """Check the Python version."""
     ok = tuple(version[:2]) >= MIN_PYTHON
     wanted = ".".join(map(str, MIN_PYTHON))
-    mend = f"install Python {wanted}, or let uv fetch it: rm -r .venv && make env"
-    return Check("interpreter", ok, f"Python {'.'.join(map(str, version))} on {platform.platform(terse=True)}", mend)
+    fix = f"install Python {wanted}, or let uv install it: rm -r .venv && make env"
+    return Check("interpreter", ok, f"Python {'.'.join(map(str, version))} on {platform.platform(terse=True)}", fix)
 
 
 def check_packages(requirements: Iterable[str] | None = None) -> Check:
-    """Check the installed version of every package in `requirements` (default: those this library declares)."""
+    """Check the installed version of every package in `requirements` (default: the library's dependencies)."""
     if requirements is None:
         requirements = importlib.metadata.requires("fedvla-lib") or []
     parsed = [Requirement(line) for line in requirements]
@@ -77,9 +78,9 @@ def check_packages(requirements: Iterable[str] | None = None) -> Check:
 
 
 def check_lock(lock: Path) -> Check:
-    """Compare the environment with the pinned versions; a difference is advice, as another version may work."""
+    """Compare installed with pinned versions; a difference is only a note, since other versions may work."""
     if not lock.is_file():
-        return Check("lock", False, f"{lock} is not there", "run in the folder of the book", required=False)
+        return Check("lock", False, f"{lock} does not exist", "run it in the folder of the book", required=False)
     pins = [Requirement(line.rstrip("\\ ")) for line in lock.read_text().splitlines() if "==" in line]
     pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate()]
     problems = [problem for pin in pins if (problem := _package_problem(pin))]
@@ -88,7 +89,7 @@ def check_lock(lock: Path) -> Check:
 
 
 def _package_problem(requirement: Requirement) -> str:
-    """Return what is wrong with the installed version of a package, or nothing."""
+    """Return what is wrong with the installed version of a package, or an empty string."""
     try:
         version = importlib.metadata.version(requirement.name)
     except importlib.metadata.PackageNotFoundError:
@@ -99,44 +100,45 @@ def _package_problem(requirement: Requirement) -> str:
 
 
 def check_rendering(timeout_s: float = RENDER_TIMEOUT_S) -> Check:
-    """Draw a frame with MuJoCo in a process of its own and look at its pixels."""
+    """Render a frame with MuJoCo in a separate process and check its pixels."""
     backend = os.environ.get("MUJOCO_GL", "")
     command = [sys.executable, "-c", DRAW_A_FRAME]
     try:
-        drawn = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:
-        return Check("rendering", False, f"no frame within {timeout_s:g} s", _rendering_mend(backend))
+        return Check("rendering", False, f"no frame within {timeout_s:g} s", _rendering_fix(backend))
     label = f"MUJOCO_GL={backend or '(not set)'}"
-    if drawn.returncode:
-        lines = drawn.stderr.strip().splitlines() or [f"MuJoCo ended with exit status {drawn.returncode}"]
+    if result.returncode:
+        lines = result.stderr.strip().splitlines() or [f"MuJoCo ended with exit status {result.returncode}"]
         reason = next((line for line in reversed(lines) if "Error" in line), lines[-1])
-        return Check("rendering", False, f"{label}: {reason.strip()}", _rendering_mend(backend))
-    red, green, blue, *corner = (float(value) for value in drawn.stdout.split()[-6:])
-    ok = red > 100 and red > 1.5 * max(green, blue, *corner)  # lit, red, and not the whole frame
-    found = f"{label}: a red box came out as RGB ({red:.0f}, {green:.0f}, {blue:.0f})"
-    return Check("rendering", ok, found, _rendering_mend(backend))
+        return Check("rendering", False, f"{label}: {reason.strip()}", _rendering_fix(backend))
+    red, green, blue, *corner = (float(value) for value in result.stdout.split()[-6:])
+    ok = red > 100 and red > 1.5 * max(green, blue, *corner)  # bright, red, and only in the middle
+    found = f"{label}: a red box was rendered as RGB ({red:.0f}, {green:.0f}, {blue:.0f})"
+    return Check("rendering", ok, found, _rendering_fix(backend))
 
 
-def _rendering_mend(backend: str) -> str:
+def _rendering_fix(backend: str) -> str:
     if sys.platform != "linux":
-        return "unset MUJOCO_GL: outside Linux MuJoCo picks its own driver"
+        return "unset MUJOCO_GL: MuJoCo chooses its own driver on this system"
     if backend != "egl":
         return f"export MUJOCO_GL=egl; if it still fails: {APT_RENDERING}"
     return f"{APT_RENDERING}; without a working EGL: apt-get install libosmesa6 && export MUJOCO_GL=osmesa"
 
 
 def check_video(codecs: Iterable[str] = CODECS) -> Check:
-    """Encode a moving square with each codec, decode it again and compare the pixels."""
+    """Encode a moving square with each codec, decode it and compare the pixels."""
+    fix = "make env (PyAV includes FFmpeg)"
     try:
         errors = {codec: _round_trip_error(codec) for codec in codecs}
-    except (ImportError, OSError, ValueError) as error:  # PyAV's errors are ValueErrors and OSErrors too
-        return Check("video", False, f"{type(error).__name__}: {error}", "make env (PyAV brings its own FFmpeg)")
-    found = ", ".join(f"{codec} off by {error:.1f} of 255" for codec, error in errors.items())
-    return Check("video", max(errors.values()) < MAX_PIXEL_ERROR, found, "make env (PyAV brings its own FFmpeg)")
+    except (ImportError, OSError, ValueError) as error:  # PyAV's errors are subclasses of these
+        return Check("video", False, f"{type(error).__name__}: {error}", fix)
+    found = ", ".join(f"{codec} error {error:.1f} of 255" for codec, error in errors.items())
+    return Check("video", max(errors.values()) < MAX_PIXEL_ERROR, found, fix)
 
 
 def _round_trip_error(codec: str, num_frames: int = 8, size: int = 64) -> float:
-    """Return the mean absolute pixel error, of 255, of a short video read back; infinity if frames are lost."""
+    """Return the mean absolute pixel error (out of 255) of a decoded short video; infinity if frames are lost."""
     import av
     import numpy as np
 
@@ -159,64 +161,60 @@ def _round_trip_error(codec: str, num_frames: int = 8, size: int = 64) -> float:
 
 
 def check_disk(folder: Path, min_free_gib: float = MIN_FREE_GIB) -> Check:
-    """Check the free space where recordings and run folders are kept."""
+    """Check the free space on the disk that holds `folder`."""
     existing = next(path for path in [folder, *folder.absolute().parents] if path.exists())
     free_gib = shutil.disk_usage(existing).free / 2**30
-    mend = f"free {max(min_free_gib - free_gib, 0):.1f} GiB, or export FEDVLA_CACHE=<a folder on a larger disk>"
+    fix = f"free {max(min_free_gib - free_gib, 0):.1f} GiB, or export FEDVLA_CACHE=<a folder on a larger disk>"
     found = f"{free_gib:.1f} GiB free, {min_free_gib:g} needed in {existing}"
-    return Check("disk", free_gib >= min_free_gib, found, mend)
+    return Check("disk", free_gib >= min_free_gib, found, fix)
 
 
 def check_cache(folder: Path) -> Check:
-    """Check that the cache folder can be made and written."""
+    """Check that the cache folder exists or can be created, and is writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as scratch:
             scratch.write(b"fedvla")
     except OSError as error:
-        return Check("cache", False, f"{folder}: {error.strerror}", "export FEDVLA_CACHE=<a folder you may write>")
+        return Check("cache", False, f"{folder}: {error.strerror}", "export FEDVLA_CACHE=<a writable folder>")
     return Check("cache", True, f"{folder} is writable")
 
 
 def check_memory(min_gib: float = MIN_MEMORY_GIB) -> Check:
-    """Check the memory of the machine, where the system tells it."""
+    """Check the memory of the machine."""
     try:
-        total_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    except (AttributeError, ValueError, OSError):
-        return Check("memory", True, "not told by this system", required=False)
-    mend = "close other programs, or use FEDVLA_PROFILE=tiny"
-    return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", mend, required=False)
+        from fedvla_lib.provenance import memory_gib
+    except ImportError as error:
+        return Check("memory", False, f"unknown: {error}", "make env", required=False)
+    total_gib, fix = memory_gib(), "close other programs, or use FEDVLA_PROFILE=tiny"
+    return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", fix, required=False)
 
 
 def check_threads(cores: int | None = None) -> Check:
-    """Compare the threads that numerical libraries would start with the cores this process may use."""
-    cores = cores or _granted_cores()
-    asked = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
-    over = [f"{name}={value}" for name, value in asked.items() if value.isdigit() and int(value) > cores]
-    found = f"{cores} cores granted" + "".join(f", {name}={value}" for name, value in asked.items())
+    """Compare the thread counts set for numerical libraries with the cores granted to this process."""
+    cores = cores or granted_cores()
+    settings = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
+    over = [f"{name}={value}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
+    found = f"{cores} cores granted" + "".join(f", {name}={value}" for name, value in settings.items())
     names = " ".join(f"{item.split('=')[0]}={cores}" for item in over)
-    mend = f"export {names}: more threads than cores is far slower"
-    return Check("threads", not over, found, mend, required=False)
-
-
-def _granted_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    fix = f"export {names}: more threads than cores are far slower"
+    return Check("threads", not over, found, fix, required=False)
 
 
 def check_hub(timeout_s: float = HUB_TIMEOUT_S) -> Check:
-    """Say whether the model and data hub answers. Only the gpu profile and hub data sets need it."""
-    offline = " (HF_HUB_OFFLINE=1 keeps the libraries from asking)" if _hub_is_switched_off() else ""
-    note = "needed for the gpu profile and hub data sets only: connect, then export HF_HUB_OFFLINE=0"
+    """Check whether the Hugging Face Hub answers; only the gpu profile and data sets on the hub need it."""
+    offline = " (HF_HUB_OFFLINE=1 keeps the libraries offline)" if _hub_is_switched_off() else ""
+    fix = "only needed for the gpu profile and data sets on the hub: connect, then export HF_HUB_OFFLINE=0"
     try:
         from huggingface_hub.constants import ENDPOINT
 
         with urllib.request.urlopen(urllib.request.Request(ENDPOINT, method="HEAD"), timeout=timeout_s):
-            return Check("hub", True, f"answers{offline}", note, required=False)
+            return Check("hub", True, f"answers{offline}", fix, required=False)
     except urllib.error.HTTPError as error:
-        return Check("hub", True, f"answers with status {error.code}{offline}", note, required=False)
+        return Check("hub", True, f"answers with status {error.code}{offline}", fix, required=False)
     except (ImportError, OSError) as error:
         reason = getattr(error, "reason", error)
-        return Check("hub", False, f"no answer: {reason}{offline}", note, required=False)
+        return Check("hub", False, f"no answer: {reason}{offline}", fix, required=False)
 
 
 def _hub_is_switched_off() -> bool:
@@ -224,7 +222,7 @@ def _hub_is_switched_off() -> bool:
 
 
 def examine(folder: Path | None = None) -> list[Check]:
-    """Run every check; `folder` (default: the cache folder) is where recordings go."""
+    """Run all checks; `folder` (default: the cache folder) is where recordings are kept."""
     folder = folder or cache_dir()
     lock = Path(__file__).parents[2] / "requirements.lock"
     checks = [check_interpreter(), check_packages(), check_lock(lock), check_rendering(), check_video()]
@@ -232,18 +230,18 @@ def examine(folder: Path | None = None) -> list[Check]:
 
 
 def can_run(checks: Iterable[Check]) -> bool:
-    """Return whether every chapter can run: no required check failed."""
+    """Return whether every chapter can run, that is, all required checks passed."""
     return all(check.ok for check in checks if check.required)
 
 
 def table(checks: list[Check]) -> str:
-    """Return the checks as text, a line each, with the mend under every one that is not right."""
+    """Return the checks as text, one line each, with the fix below each failure."""
     width = max(len(check.name) for check in checks)
     lines = []
     for check in checks:
         mark = "ok     " if check.ok else "MISSING" if check.required else "note   "
         lines.append(f"{mark}  {check.name:<{width}}  {check.found}")
         if not check.ok:
-            lines.append(f"{'':9}{'':<{width}}  -> {check.mend}")
-    lines.append("Every chapter can run here." if can_run(checks) else "A chapter could not run: mend what is MISSING.")
+            lines.append(f"{'':9}{'':<{width}}  -> {check.fix}")
+    lines.append("Every chapter can run here." if can_run(checks) else "Some chapters cannot run: fix what is MISSING.")
     return "\n".join(lines)
