@@ -94,8 +94,8 @@ def test_without_cameras_an_actor_sees_the_moment_at_which_it_looks(env):
 
 
 def test_what_is_not_filmed_is_drawn_only_where_the_actor_looks_and_ends_the_same(tmp_path, monkeypatch):
-    drawn, draw = [], So100Env.pictures
-    monkeypatch.setattr(So100Env, "pictures", lambda sim, *names: drawn.append(sim) or draw(sim, *names))
+    drawn, draw = [], So100Env.camera_images
+    monkeypatch.setattr(So100Env, "camera_images", lambda sim, *names: drawn.append(sim) or draw(sim, *names))
     whole = evaluate(Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "all", progress=False)
     some = evaluate(
         Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "first", films=1, progress=False

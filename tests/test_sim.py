@@ -372,7 +372,7 @@ def test_jitter_furnishes_every_episode_anew_and_the_seed_decides():
 
 def test_environments_can_share_a_renderer():
     first = So100Env("place", image_size=SIZE)
-    second = So100Env("place", image_size=SIZE, screen=first)
+    second = So100Env("place", image_size=SIZE, renderer_of=first)
     first.reset(seed=1)
     shared = second.reset(seed=2)[0]["pixels"]
     own = So100Env("place", image_size=SIZE).reset(seed=2)[0]["pixels"]
@@ -386,7 +386,7 @@ def test_a_tossed_cube_is_not_lifted():
     for speed_mps in (1.0, 2.0, 3.0):
         set_cube(env, env.cube_m, (0.0, 0.0, speed_mps))
         assert not wait(env, steps=20)
-        assert env._past[0].peak_clearance_m > LIFT_CLEARANCE_M
+        assert env._histories[0].peak_clearance_m > LIFT_CLEARANCE_M
 
 
 def test_a_cube_knocked_into_the_circle_is_not_pushed():
@@ -537,7 +537,7 @@ def test_drawing_that_cannot_work_says_what_to_set(driver, first):
     mute = {**os.environ, "MUJOCO_GL": driver}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=mute)
     message = done.stderr.strip().splitlines()[-1]
-    assert message.startswith(f"RuntimeError: cannot draw off screen with MUJOCO_GL={driver!r}"), done.stderr
+    assert message.startswith(f"RuntimeError: cannot render off screen with MUJOCO_GL={driver!r}"), done.stderr
     assert "set MUJOCO_GL to egl, osmesa or glfw before mujoco is first imported" in message
 
 

@@ -64,7 +64,7 @@ def _episodes(
     together = getattr(actor, "act_together", act_in_turn)
     size = min(len(seeds), 1 if together is act_in_turn else AT_ONCE)
     screen = So100Env(task, image_size)
-    envs = [screen, *(So100Env(task, image_size, screen=screen) for _ in range(1, size))]
+    envs = [screen, *(So100Env(task, image_size, renderer_of=screen) for _ in range(1, size))]
     with closing(screen):
         for start in range(0, len(seeds), max(1, size)):
             group = seeds[start : start + size]

@@ -1,4 +1,4 @@
-"""Where things stand on the table: regions to draw from, cubes, zones, and a drawn layout.
+"""Objects on the table: regions to draw positions from, cubes, zones, and the drawn layout.
 
 Lengths are metres in the world frame of `tasks`.
 """
@@ -18,7 +18,7 @@ CUBE_HALF_M = 0.014  # half the edge of the cube
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the table in polar coordinates around the arm's first joint."""
+    """Part of the table, in polar coordinates around the arm's first joint."""
 
     radius_m: tuple[float, float]
     bearing_deg: tuple[float, float]  # 0 is straight ahead, positive to the arm's left
@@ -26,16 +26,16 @@ class Region:
 
 @dataclass(frozen=True)
 class Patch:
-    """A flat coloured shape on the table: where it may lie and how large it is."""
+    """A flat coloured shape on the table."""
 
-    region: Region
+    region: Region  # where its centre may be
     shape: str  # "square" (yellow) or "disc" (white)
     half_m: float  # half the side of the square, or the radius of the disc
 
 
 @dataclass(frozen=True)
 class Cube:
-    """One cube at the start of an episode."""
+    """A cube at the start of an episode."""
 
     color: str
     xy_m: tuple[float, float]
@@ -44,7 +44,7 @@ class Cube:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand at the start of an episode, and what is asked for."""
+    """Instruction and object poses at the start of an episode."""
 
     instruction: str
     cubes: tuple[Cube, ...]  # the first is the one to move
@@ -57,27 +57,27 @@ class Layout:
 
     @property
     def cube_xy_m(self) -> tuple[float, float]:
-        """Where the first cube stands."""
+        """Centre of the first cube."""
         return self.cubes[0].xy_m
 
     @property
     def cube_yaw_rad(self) -> float:
-        """How the first cube is turned."""
+        """Yaw of the first cube."""
         return self.cubes[0].yaw_rad
 
     @property
     def zone_xy_m(self) -> tuple[float, float] | None:
-        """Centre of the first zone, if there is one."""
+        """Centre of the first zone; None without a zone."""
         return self.zones_xy_m[0] if self.zones_xy_m else None
 
 
-MAX_CUBE_YAW_RAD = np.deg2rad(25.0)  # cube faces turn at most this much from the arm's direction
-CUBES_APART_M = 0.058  # between the centres of two cubes: the open jaws go between them
+MAX_CUBE_YAW_RAD = np.deg2rad(25.0)  # largest angle between a cube face and the direction from the base
+CUBES_APART_M = 0.058  # minimum distance between cube centres, so that the open jaws fit between them
 ZONES_APART_M = 0.10
 
 
 def check_color(color: str) -> str:
-    """Return `color` if a cube can have it, else raise ValueError listing the valid ones."""
+    """Return `color`; raise ValueError listing the valid colours if it is unknown."""
     if color not in COLORS:
         raise ValueError(f"unknown colour {color!r}: choose one of {', '.join(COLORS)}")
     return color
@@ -87,7 +87,7 @@ Point = tuple[tuple[float, float], float]  # x and y in metres, bearing in radia
 
 
 def draw_apart(regions: list[Region], apart_m: float, rng: np.random.Generator) -> list[Point]:
-    """One point in each region; all are drawn again until each two are at least `apart_m` from each other."""
+    """Draw one point in each region; redraw all of them until every two are at least `apart_m` apart."""
     while True:
         points = [_draw_point(region, rng) for region in regions]
         if all(np.linalg.norm(np.subtract(a[0], b[0])) >= apart_m for a, b in combinations(points, 2)):

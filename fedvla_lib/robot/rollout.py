@@ -1,4 +1,4 @@
-"""The one loop in which an actor moves the arm; recording demonstrations and evaluating policies share it."""
+"""The control loop: an actor moves the arm. Used to record demonstrations and to evaluate policies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened: `states[t]` and the images at t are what the actor saw when it chose `actions[t]`."""
+    """One episode: `states[t]` and the images at t are what the actor observed when it chose `actions[t]`."""
 
     task: str
     instruction: str
     color: str
     seed: int
     states: np.ndarray  # float32 (T, 6), LeRobot units
-    actions: np.ndarray  # float32 (T, 6), joint targets as the actor gave them
-    images: dict[str, np.ndarray]  # camera -> uint8 (T, H, W, 3); empty if the environment draws none
+    actions: np.ndarray  # float32 (T, 6), joint targets given by the actor
+    images: dict[str, np.ndarray]  # camera -> uint8 (T, H, W, 3); empty for an environment without cameras
     success: bool
 
     @property
@@ -32,50 +32,50 @@ class Episode:
 
     @property
     def duration_s(self) -> float:
-        """Length in seconds of the arm's time."""
+        """Simulated duration in seconds."""
         return self.num_frames / FPS
 
 
-# Chooses an action for each of several actors that act at the same time, from what each of them sees.
+# Returns one action per actor from one observation per actor.
 ActTogether = Callable[[Sequence[Actor], Sequence[Observation]], Sequence[np.ndarray]]
 
 
 def run_episode(env: "So100Env", actor: Actor, seed: int) -> Episode:
-    """Run `actor` in `env` from the reset with `seed` until success or the task's horizon.
+    """Reset `env` with `seed` and run `actor` until success or the task's horizon.
 
     Raises:
-        ValueError: the actor returned something else than six finite numbers.
+        ValueError: the actor returned something other than six finite numbers.
     """
     return run_episodes([env], [actor], [seed])[0]
 
 
 def act_in_turn(actors: Sequence[Actor], observations: Sequence[Observation]) -> list[np.ndarray]:
-    """Let each actor choose on its own."""
+    """Call each actor separately."""
     return [actor.act(observation) for actor, observation in zip(actors, observations, strict=True)]
 
 
 def run_episodes(
     envs: Sequence["So100Env"], actors: Sequence[Actor], seeds: Sequence[int], together: ActTogether = act_in_turn
 ) -> list[Episode]:
-    """Run an episode in each environment, all in step, so that a model can choose for all of them at once.
+    """Run one episode per environment in lockstep, so that a model can compute the actions of all of them in one batch.
 
-    An environment without cameras draws only when its actor looks at ``observation["pixels"]``, which a policy does
-    once a chunk; its episode keeps no pictures.
+    An environment without cameras renders only when its actor reads ``observation["pixels"]``, which a policy does once
+    per chunk; its episode has no images.
 
     Args:
-        envs: one environment, `actors` one actor and `seeds` one seed for each episode.
-        together: chooses the actions of those that are not done yet.
+        envs: one environment, `actors` one actor and `seeds` one seed per episode.
+        together: chooses the actions of the episodes that are still running.
     """
-    courses = [RunningEpisode(env, actor, seed) for env, actor, seed in zip(envs, actors, seeds, strict=True)]
-    while running := [course for course in courses if not course.over]:
-        actions = together([course.actor for course in running], [course.observation for course in running])
-        for course, action in zip(running, actions, strict=True):
-            course.step(np.asarray(action, dtype=np.float32))
-    return [course.episode() for course in courses]
+    episodes = [RunningEpisode(env, actor, seed) for env, actor, seed in zip(envs, actors, seeds, strict=True)]
+    while running := [episode for episode in episodes if not episode.over]:
+        actions = together([episode.actor for episode in running], [episode.observation for episode in running])
+        for episode, action in zip(running, actions, strict=True):
+            episode.step(np.asarray(action, dtype=np.float32))
+    return [episode.result() for episode in episodes]
 
 
 class LazyObservation(dict):
-    """An observation whose pictures are drawn when they are first asked for, of the scene as it then stands."""
+    """An observation whose images are rendered on first access, from the state of the scene at that moment."""
 
     def __init__(self, observation: Observation, env: "So100Env") -> None:
         super().__init__(observation)
@@ -84,41 +84,41 @@ class LazyObservation(dict):
     def __missing__(self, key: str) -> dict[str, np.ndarray]:
         if key != "pixels":
             raise KeyError(key)
-        self[key] = self._env.pictures()
+        self[key] = self._env.camera_images()
         return self[key]
 
 
 class RunningEpisode:
-    """An episode on its way."""
+    """An episode that is still running."""
 
     def __init__(self, env: "So100Env", actor: Actor, seed: int) -> None:
         self.env, self.actor, self.seed = env, actor, seed
-        self.observation = self._shown(env.reset(seed=seed)[0])
+        self.observation = self._observed(env.reset(seed=seed)[0])
         actor.reset(env, seed)
         self.over = self._success = False
-        self._seen: list[Observation] = []
+        self._observations: list[Observation] = []
         self._actions: list[np.ndarray] = []
 
     def step(self, action: np.ndarray) -> None:
-        self._seen.append(self.observation)
+        self._observations.append(self.observation)
         self._actions.append(action)
         observation, _, terminated, truncated, info = self.env.step(action)
-        self.observation = self._shown(observation)
+        self.observation = self._observed(observation)
         self.over, self._success = terminated or truncated, bool(info["is_success"])
 
-    def _shown(self, observation: Observation) -> Observation:
+    def _observed(self, observation: Observation) -> Observation:
         sim = self.env.unwrapped
         return observation if sim.cameras else LazyObservation(observation, sim)
 
-    def episode(self) -> Episode:
+    def result(self) -> Episode:
         sim = self.env.unwrapped
         return Episode(
             task=sim.task,
             instruction=sim.instruction,
             color=sim.layout.color,
             seed=self.seed,
-            states=np.stack([frame["agent_pos"] for frame in self._seen]).reshape(-1, NUM_JOINTS),
+            states=np.stack([frame["agent_pos"] for frame in self._observations]).reshape(-1, NUM_JOINTS),
             actions=np.stack(self._actions),
-            images={camera: np.stack([frame["pixels"][camera] for frame in self._seen]) for camera in sim.cameras},
+            images={name: np.stack([frame["pixels"][name] for frame in self._observations]) for name in sim.cameras},
             success=self._success,
         )

@@ -1,14 +1,13 @@
-"""So100Env: a simulated SO-100 arm as a Gymnasium environment. Nothing here knows about learning.
+"""So100Env: a simulated SO-100 arm as a Gymnasium environment. Does not know about learning.
 
 State and action are LeRobot's six numbers: five joints in degrees, the gripper from 0 (closed) to 100 (open). MuJoCo
-works in radians; the two differ by an offset, as in LeRobot's calibration, where zero is about the middle of a joint's
-travel:
+uses radians. As in LeRobot's calibration, where zero is about the middle of a joint's range, there is an offset:
 
     degrees = ZERO_DEG + 180 / pi * radians,   gripper = 100 * (radians - closed) / (open - closed)
 
-so that at zero degrees the upper arm is vertical and the forearm horizontal, pointing straight ahead. Positive
-shoulder_pan turns to the arm's left, positive shoulder_lift leans forward, positive elbow_flex and wrist_flex bend the
-gripper down. The closed and open ends of the gripper are the ends of its joint's range in the model.
+At zero degrees the upper arm is vertical and the forearm horizontal, pointing straight ahead. Positive shoulder_pan
+turns to the arm's left, positive shoulder_lift leans forward, positive elbow_flex and wrist_flex bend the gripper down.
+"closed" and "open" are the limits of the gripper's joint range in the model.
 """
 
 from collections.abc import Sequence
@@ -38,31 +37,31 @@ from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.robot.tasks import ALL_TASKS, CARRY_CLEARANCE_M, Task, TaskState, check_tasks, draw_layout
 
 ENV_ID = "fedvla/So100-v0"
-ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # degrees that a joint shows when MuJoCo's angle is zero
-HOME = np.array([0.0, -50.0, 30.0, 75.0, 0.0, 30.0])  # arm drawn back, gripper down and a third open; LeRobot units
-HOME_NOISE = 2.0  # each reset moves every joint by up to this much, in its unit
+ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # LeRobot's angle of each joint at MuJoCo's zero
+HOME = np.array([0.0, -50.0, 30.0, 75.0, 0.0, 30.0])  # arm retracted, gripper down and a third open; LeRobot units
+HOME_NOISE = 2.0  # half range of the uniform noise on each joint at reset, in its unit
 IMAGE_SIZES = (16, 1024)  # smallest and largest camera image, in pixels
 SUBSTEPS = round(1 / (FPS * TIMESTEP_S))
-FLUNG_SPEED_MPS = 0.10  # an untouched cube faster than this over a whole control step has been flung
+FLUNG_SPEED_MPS = 0.10  # a cube not touched during a control step but faster than this at its end was flung
 
 
 class So100Env(gymnasium.Env):
     """One SO-100 arm, one task with its cubes, two fixed cameras, controlled at 10 Hz.
 
     Observation: ``{"pixels": {camera: uint8 (size, size, 3)}, "agent_pos": float32 (6,)}``. Action: float32 (6,), the
-    joint targets in the same units, clipped to the joint ranges. The reward is 1 when the task is fulfilled, which ends
-    the episode; the task's horizon truncates it.
+    joint targets in the same units, clipped to the joint ranges. The reward is 1 on success, which terminates the
+    episode; the task's horizon truncates it.
 
     Args:
-        task: a name from `tasks.ALL_TASKS`, or a task of your own.
+        task: a name from `tasks.ALL_TASKS`, or a `Task`.
         image_size: side of the square camera images in pixels.
         render_mode: ``"rgb_array"`` or None; `render` returns all cameras side by side.
-        cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and with it nearly all of the time. What
-            `pictures` returns does not depend on it.
-        lab: the place: camera poses, light, colours, calibration of the arm.
-        screen: draw with this environment's renderer, which costs more to open than to use; it must show the same task
-            at the same size, and stay open.
-        jitter: above 0, every episode has a laboratory of its own, drawn with this spread; its arm is calibrated.
+        cameras: cameras in the observation; ``()`` leaves out ``"pixels"`` and saves nearly all of the time of a step.
+            `camera_images` does not depend on it.
+        lab: camera poses, light, colours and calibration of the arm.
+        jitter: above 0, a new lab without calibration offsets is drawn for every episode, with this spread.
+        renderer_of: share this environment's renderer, since opening one is slow; it must have the same task and image
+            size, and stay open.
 
     Raises:
         ValueError: unknown task, camera or render mode, or an unusable image size.
@@ -78,7 +77,7 @@ class So100Env(gymnasium.Env):
         cameras: tuple[str, ...] = CAMERAS,
         lab: Lab = REFERENCE,
         jitter: float = 0.0,
-        screen: "So100Env | None" = None,
+        renderer_of: "So100Env | None" = None,
     ) -> None:
         self._task = task if isinstance(task, Task) else ALL_TASKS[check_tasks([task])[0]]
         _check_view(image_size, render_mode, cameras)
@@ -91,7 +90,7 @@ class So100Env(gymnasium.Env):
         self.model = build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: SceneRenderer | None = None
-        self._screen = screen  # not itself: what refers to itself is freed late, and by any thread
+        self._renderer_of = renderer_of  # never self: a reference cycle would be freed late, in any thread
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
         self._parts = _parts(self.model)
@@ -100,27 +99,27 @@ class So100Env(gymnasium.Env):
 
     @property
     def instruction(self) -> str:
-        """The request in words, for the cubes' colours in this episode."""
+        """The instruction of this episode."""
         return self.layout.instruction
 
     @property
     def zones(self) -> tuple[Patch, ...]:
-        """The coloured patches on the table, in the layout's order."""
+        """The task's zones, in the order of the layout."""
         return self._task.zones
 
     @property
     def task_description(self) -> str:
-        """The instruction under the name that LeRobot's evaluation asks for."""
+        """The instruction, under the name used by LeRobot's evaluation."""
         return self.instruction
 
     @property
     def joints(self) -> np.ndarray:
-        """Joint positions as the arm reports them, float32 (6,), LeRobot units: with its calibration error."""
+        """Reported joint positions, with calibration error, float32 (6,), LeRobot units."""
         return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS]) + self.joint_offset
 
     @property
     def joint_offset(self) -> np.ndarray:
-        """What the arm reports minus what is true, float32 (6,), LeRobot units."""
+        """Calibration error: reported minus true joint positions, float32 (6,), LeRobot units."""
         return np.append(self.lab.joint_offset_deg, 0.0).astype(np.float32)
 
     @property
@@ -132,8 +131,8 @@ class So100Env(gymnasium.Env):
         """Start an episode.
 
         Args:
-            seed: fixes where everything is.
-            options: ``"color"`` fixes the first cube's colour, ``"joints"`` where the arm starts, (6,), LeRobot units.
+            seed: fixes the layout and the start pose.
+            options: ``"color"``, the first cube's colour; ``"joints"``, the start pose, (6,), LeRobot units.
 
         Raises:
             ValueError: unknown colour, or joints that are not six finite numbers.
@@ -150,16 +149,17 @@ class So100Env(gymnasium.Env):
         place_objects(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
-        self._past = [_Past(self._cube_m(name)) for name in cubes_of(self.model)[: len(self.layout.cubes)]]
+        cubes = cubes_of(self.model)[: len(self.layout.cubes)]
+        self._histories = [_CubeHistory(self._cube_m(name)) for name in cubes]
         self._needs_reset = False
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
-        """Move towards `action` for a tenth of a second.
+        """Move towards the joint targets `action` for one control step.
 
         Raises:
             ValueError: `action` is not six finite numbers.
-            RuntimeError: the episode is over or never began.
+            RuntimeError: the episode is over or was never started.
         """
         target = _check_joints(action, "action") - self.joint_offset
         if self._needs_reset:
@@ -168,7 +168,7 @@ class So100Env(gymnasium.Env):
         self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
         touched = self._advance()
         task = self._task
-        first, *others = (self._look(index, touched) for index in range(len(self._past)))
+        first, *others = (self._measure(index, touched) for index in range(len(self._histories)))
         self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
         terminated = self._streak >= task.hold_steps
@@ -176,18 +176,18 @@ class So100Env(gymnasium.Env):
         self._needs_reset = terminated or truncated
         return self._observation(), float(terminated), terminated, truncated, self._info()
 
-    def pictures(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
-        """Draw the scene as it stands: camera -> uint8 (size, size, 3)."""
+    def camera_images(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
+        """Render the current scene: camera -> uint8 (size, size, 3)."""
         return {camera: self._draw(camera) for camera in cameras}
 
     def render(self) -> np.ndarray | None:
         """Return all cameras side by side, uint8 (size, 2 * size, 3); None without a render mode."""
         if self.render_mode is None:
             return None
-        return np.hstack(list(self.pictures().values()))
+        return np.hstack(list(self.camera_images().values()))
 
     def close(self) -> None:
-        """Free the renderer; the other environments of the process keep theirs."""
+        """Free the renderer; other environments of the process keep theirs."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -201,12 +201,12 @@ class So100Env(gymnasium.Env):
         return tuple(float(value) for value in self.data.body(name).xpos)
 
     def _advance(self) -> set[str]:
-        """Simulate one control step; the cubes that the arm touched at any moment of it."""
+        """Simulate one control step; return the cubes that the arm touched during it."""
         touched = set()
         for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
-            touched |= {name for name in CUBES[: len(self._past)] if self._touching(name)}
-        mujoco.mj_forward(self.model, self.data)  # positions and contacts of the state that is shown
+            touched |= {name for name in CUBES[: len(self._histories)] if self._touching(name)}
+        mujoco.mj_forward(self.model, self.data)  # update positions and contacts to the final state
         return touched
 
     def _touching(self, cube: str) -> set[str]:
@@ -216,34 +216,34 @@ class So100Env(gymnasium.Env):
         others = pairs[(pairs == geom).any(axis=1)]
         return {self._parts[other] for other in others[others != geom]} - {""}
 
-    def _look(self, index: int, touched_in_step: set[str]) -> TaskState:
-        """Measure what the success predicates look at, for one cube, and remember what happened on the way."""
-        name, past = CUBES[index], self._past[index]
+    def _measure(self, index: int, touched_in_step: set[str]) -> TaskState:
+        """Update the history of one cube and return the input of the success predicates."""
+        name, history = CUBES[index], self._histories[index]
         parts, cube_m = self._touching(name), self._cube_m(name)
         hand_m = tuple(float(value) for value in self.data.site(GRASP_SITE).xpos)
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
-        past.peak_clearance_m = max(past.peak_clearance_m, clearance_m)
-        past.carried |= held and clearance_m > CARRY_CLEARANCE_M
-        past.flung |= name not in touched_in_step and speed_mps > FLUNG_SPEED_MPS
+        history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
+        history.carried |= held and clearance_m > CARRY_CLEARANCE_M
+        history.flung |= name not in touched_in_step and speed_mps > FLUNG_SPEED_MPS
         return TaskState(
             clearance_m=clearance_m,
-            peak_clearance_m=past.peak_clearance_m,
+            peak_clearance_m=history.peak_clearance_m,
             speed_mps=speed_mps,
             zone_offset_m=self._from_zone(index, cube_m),
             held=held,
             touched=bool(parts),
-            carried=past.carried,
-            flung=past.flung,
+            carried=history.carried,
+            flung=history.flung,
             hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))),
             cube_m=cube_m,
-            start_m=past.start_m,
+            start_m=history.start_m,
             hand_m=hand_m,
             hand_zone_offset_m=self._from_zone(index, hand_m),
         )
 
     def _from_zone(self, index: int, point_m: tuple[float, float, float]) -> tuple[float, float]:
-        """Where a point lies as seen from the centre of the zone that belongs to cube `index`."""
+        """Offset (x, y) of a point from the centre of cube `index`'s zone."""
         if index >= len(self.layout.zones_xy_m):
             return np.inf, np.inf
         x, y = np.subtract(point_m[:2], self.layout.zones_xy_m[index])
@@ -252,17 +252,17 @@ class So100Env(gymnasium.Env):
     def _observation(self) -> Observation:
         observation: Observation = {"agent_pos": self.joints}
         if self.cameras:
-            observation["pixels"] = self.pictures(self.cameras)
+            observation["pixels"] = self.camera_images(self.cameras)
         return observation
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self._streak >= self._task.hold_steps}
 
     def _draw(self, camera: str) -> np.ndarray:
-        screen = self._screen or self
-        if screen._renderer is None:
-            screen._renderer = open_renderer(screen.model, screen.image_size)
-        return screen._renderer.draw(self.model, self.data, camera)
+        owner = self._renderer_of or self
+        if owner._renderer is None:
+            owner._renderer = open_renderer(owner.model, owner.image_size)
+        return owner._renderer.draw(self.model, self.data, camera)
 
     def _range(self) -> tuple[np.ndarray, np.ndarray]:
         limits_rad = self.model.jnt_range[:NUM_JOINTS]
@@ -279,8 +279,8 @@ class So100Env(gymnasium.Env):
 
 
 @dataclass
-class _Past:
-    """What happened to a cube in this episode."""
+class _CubeHistory:
+    """What has happened to a cube so far in this episode."""
 
     start_m: tuple[float, float, float]
     peak_clearance_m: float = 0.0
@@ -305,7 +305,7 @@ def from_radians(angles_rad: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
 def _check_joints(values: np.ndarray, what: str) -> np.ndarray:
     target = np.asarray(values, dtype=np.float64)
     if target.shape != (NUM_JOINTS,):
-        raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one target for each of {JOINTS}")
+        raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one value for each of {JOINTS}")
     for name, value in zip(JOINTS, target, strict=True):
         if not np.isfinite(value):
             raise ValueError(f"{what} for {name} is {value}: give a finite number")
@@ -324,7 +324,7 @@ def _check_view(image_size: int, render_mode: str | None, cameras: tuple[str, ..
 
 
 def _parts(model: mujoco.MjModel) -> list[str]:
-    """For every geom, the part of the arm it belongs to: "fixed", "moving", "arm", or "" for what is not the arm."""
+    """The arm's part that each geom belongs to: "fixed", "moving" (the jaws), "arm", or "" if it is not the arm's."""
     jaws = {"Fixed_Jaw": "fixed", "Moving_Jaw": "moving"}
     others = dict.fromkeys(("world", *CUBES, *ZONES), "")
     bodies = [model.body(body).name for body in model.geom_bodyid]

@@ -1,7 +1,7 @@
-"""Names, units and the one contract every other module shares.
+"""Joint, camera and feature names, units, and the `Actor` protocol, shared by every other module.
 
 State and action are six numbers in LeRobot's SO-100 convention: five joint positions in degrees, then the gripper
-opening from 0 (closed) to 100 (open). This module imports nothing of ours and does not know MuJoCo, torch or Flower.
+opening from 0 (closed) to 100 (open). This module imports nothing from the library, nor MuJoCo, torch or Flower.
 """
 
 from typing import Any, Protocol
@@ -23,7 +23,7 @@ FPS = 10  # control steps per second; also the frame rate of every recording and
 
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
-LAB_KEY = "lab_index"  # which laboratory a frame was recorded in; data sets of one laboratory lack it
+LAB_KEY = "lab_index"  # the lab in which a frame was recorded; data sets of a single lab do not have it
 IMAGE_PREFIX = "observation.images."
 
 # A Gymnasium observation: {"pixels": {camera: uint8 (H, W, 3)}, "agent_pos": float32 (6,)}.
@@ -36,10 +36,10 @@ def image_key(camera: str) -> str:
 
 
 class Actor(Protocol):
-    """Whoever moves the arm: a scripted expert or a policy. `rollout.run_episode` drives either."""
+    """Controls the arm: a scripted expert or a policy. `rollout.run_episode` runs either."""
 
     def reset(self, env: Any, seed: int) -> None:
-        """Start a new episode in `env`, which has just been reset with `seed`."""
+        """Prepare for a new episode in `env`, which has just been reset with `seed`."""
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the next joint targets, float32 (6,), in the units of this module."""
