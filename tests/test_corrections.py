@@ -69,8 +69,8 @@ def serving(grid, examples, share, rounds_done=0, **settings):
     nodes = grid.get_node_ids()
     weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
     return build.build_strategy(
-        Config(**settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
-        report=lambda *_: None, keep_rollouts=lambda *_: None, train_share=share, rounds_done=rounds_done,
+        Config(fraction_train=share, **settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
+        report=lambda *_: None, keep_rollouts=lambda *_: None, rounds_done=rounds_done,
     )  # fmt: skip
 
 
@@ -258,7 +258,7 @@ def test_a_damaged_control_variate_is_rejected():
     nodes = grid.get_node_ids()
     seen = []
     strategy = build.build_strategy(
-        Config(strategy="scaffold"), dict.fromkeys(nodes, 0.5), shapes={"w": (1,)},
+        Config(strategy="scaffold", fraction_train=1.0), dict.fromkeys(nodes, 0.5), shapes={"w": (1,)},
         roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
         report=lambda _, who, kind, values: seen.append((who, kind, values.get("reason"))),
         keep_rollouts=lambda *_: None,

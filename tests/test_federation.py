@@ -65,8 +65,8 @@ def test_one_client_averaging_equals_local_training_bit_for_bit(tiny, rank, tmp_
     batches = Batches(
         store, train_ids, config.chunk_size, config.batch_size, client_seed(config.seed, 0), config.augment
     )
-    for start_step in (0, 3):
-        training.local_train(bundle, batches, config, steps=3, start_step=start_step, total_steps=6, progress=False)
+    for start in (training.Start(0, 6), training.Start(3, 6)):
+        training.local_train(bundle, batches, config, steps=3, start=start, progress=False)
     model.save_policy(bundle, tmp_path / "local")  # with adapters added in
     assert same(federated, load_file(tmp_path / "local" / "model.safetensors"))
 
@@ -140,7 +140,8 @@ def test_a_reloaded_global_model_measures_the_same(full_run):
     config = run_folder.read_config(full_run)
     store = recordings.open_frames(config)
     bundle = model.load_policy(replace(config, base=str(full_run / "global_model/round_2")))
-    frames, again = measure.measure_held_out(bundle, store, splits.held_out_episodes(store, config), config)
+    found = measure.measure(bundle, store, config)
+    frames, again = found.num_examples, found.averages
     logged = run_folder.read_metrics(full_run, "evaluate").query("who == 'global' and round == 2").iloc[0]
     assert frames == logged.num_examples
     assert again["loss"] == pytest.approx(logged.loss, rel=1e-6)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fedvla_lib.policy import model
-from fedvla_lib.policy.training import local_train
+from fedvla_lib.policy.training import Objective, local_train
 from fedvla_lib.pretraining import grounding, pretrain
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.pretraining.scenes import THINGS, draw_scenes
@@ -97,7 +97,7 @@ def test_training_lowers_the_error_and_moves_what_sees_only(scenes, bundle):
     with grounding.probing(bundle, seed=0):
         first = grounding.grounding_loss(bundle, batch).item()
         local_train(bundle, _Same(batch), replace(pretrain.settings(SMALL), warmup_steps=1), steps=30,
-                    progress=False, loss=grounding.grounding_loss)  # fmt: skip
+                    progress=False, objective=Objective(grounding.grounding_loss))  # fmt: skip
         assert grounding.grounding_loss(bundle, batch).item() < 0.7 * first
     after = dict(bundle.policy.named_parameters())
     assert after.keys() == before.keys()  # the probes are gone

@@ -75,17 +75,20 @@ class Events(list):
         return {who: values["reason"] for _, who, kind, values in self if kind == "rejected"}
 
 
-def one_round(app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, config=None, **options):
-    """Return the aggregated arrays, the metrics and the events of one training round."""
+def one_round(
+    app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, shapes=SHAPES, **settings
+):
+    """Return the aggregated arrays, the metrics and the events of one training round with all clients, unless told."""
     events = Events()
     grid = InlineGrid(app, num_clients, {})
     nodes = grid.get_node_ids()
     examples_of = dict.fromkeys(nodes, announced) if announced else {}
     roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of)
-    options = {"shapes": SHAPES, "report": events.log, "keep_rollouts": lambda *_: None, **options}
-    config = config or Config()
-    options.setdefault("clip_norm", config.clip_norm)
-    strategy = build.build_strategy(config, {node: 1 / num_clients for node in nodes}, roster=roster, **options)
+    config = Config(**{"fraction_train": 1.0, **settings})
+    strategy = build.build_strategy(
+        config, {node: 1 / num_clients for node in nodes}, roster=roster, shapes=shapes, report=events.log,
+        keep_rollouts=lambda *_: None,
+    )  # fmt: skip
     start = start or random_arrays(99)
     messages = strategy.configure_train(server_round, pack_arrays(start), ConfigRecord(), grid)
     replies = grid.send_and_receive(messages)
@@ -278,7 +281,7 @@ def test_one_poisoned_client_of_ten_breaks_fedavg_and_not_the_robust_strategies(
     }  # fmt: skip
     off = {}
     for name, settings in servers.items():
-        arrays, _, _ = one_round(answering(moved), 10, start=start, config=Config(**settings))
+        arrays, _, _ = one_round(answering(moved), 10, start=start, **settings)
         off[name] = np.linalg.norm(flat(arrays) - flat(start) - flat(wanted)) / np.linalg.norm(flat(wanted))
     assert off["fedmedian"] < 0.2 and off["krum"] < 0.5 and off["clipped"] < 0.35
     assert off["fedavg"] > (2 * off["fedmedian"] if factor == -1.0 else 1.5)
@@ -305,7 +308,7 @@ def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
     length, limit = float(np.linalg.norm(flat(wanted))), 0.5
 
     def movement(**settings):
-        arrays, _, events = one_round(answering(moved), 10, start=start, config=Config(**settings))
+        arrays, _, events = one_round(answering(moved), 10, start=start, **settings)
         assert not events.rejected()
         return (flat(arrays) - flat(start)) / length, flat(wanted) / length
 
@@ -341,7 +344,13 @@ def test_a_client_that_never_answers_is_reported():
     events = Events()
     grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
-    strategy = CheckedFedAvg(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None)
+    strategy = CheckedFedAvg(
+        config=Config(fraction_train=1.0),
+        roster=roster,
+        shapes=SHAPES,
+        report=events.log,
+        keep_rollouts=lambda *_: None,
+    )
     messages = strategy.configure_train(1, pack_arrays(GOOD), ConfigRecord(), grid)
     strategy.aggregate_train(1, grid.send_and_receive(messages)[:1])
     assert events.rejected() == {"client_1": "silent"}
@@ -371,9 +380,9 @@ def test_clients_are_drawn_from_the_seed_by_partition_not_by_node():
 def test_a_share_of_the_clients_is_asked():
     asked = []
     app = answering(lambda k, _: asked.append(k) or reply_content(random_arrays(k)))
-    one_round(app, 10, train_share=0.4, seed=3)
+    one_round(app, 10, fraction_train=0.4, seed=3)
     first = list(asked)
-    one_round(app, 10, train_share=0.4, seed=3)
+    one_round(app, 10, fraction_train=0.4, seed=3)
     assert len(first) == 4
     assert asked == first * 2
 

@@ -11,6 +11,7 @@ from fedvla_lib.evaluation.held_out import validate
 from fedvla_lib.federation import messages
 from fedvla_lib.policy import model, training
 from fedvla_lib.policy.parameters import load_arrays, trainable, trainable_arrays
+from fedvla_lib.policy.training import Checkpoints, Objective, Start
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
 CONFIG = from_profile("tiny", base="nano-random", checkpoint_every=2, num_threads=1, train_expert_only=False)
@@ -53,7 +54,7 @@ def run(steps, **kwargs):
 
 @pytest.mark.unit
 def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
-    whole, whole_result = run(6, checkpoint_dir=tmp_path / "whole")
+    whole, whole_result = run(6, checkpoints=Checkpoints(tmp_path / "whole"))
 
     class Dies(SyntheticBatches):
         def at(self, step):
@@ -63,9 +64,9 @@ def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
 
     broken = model.load_policy(CONFIG, STATS)
     with pytest.raises(KeyboardInterrupt):
-        training.local_train(broken, Dies(), CONFIG, steps=6, checkpoint_dir=tmp_path / "cut", progress=False)
+        training.local_train(broken, Dies(), CONFIG, steps=6, checkpoints=Checkpoints(tmp_path / "cut"), progress=False)
     assert [p.name for p in sorted((tmp_path / "cut").iterdir())] == ["step_000002", "step_000004"]
-    resumed, resumed_result = run(6, checkpoint_dir=tmp_path / "cut", resume=True)
+    resumed, resumed_result = run(6, checkpoints=Checkpoints(tmp_path / "cut", resume=True))
     assert resumed_result.losses == whole_result.losses
     assert same(weights(whole), weights(resumed))
 
@@ -154,14 +155,14 @@ def _decay(bundle, batch):
 @pytest.mark.unit
 def test_a_kept_optimiser_state_makes_two_phases_equal_to_one():
     whole, parts, fresh = (model.load_policy(CONFIG, STATS) for _ in range(3))
-    common = {"total_steps": 6, "progress": False, "loss": _decay}
+    common = {"objective": Objective(_decay), "progress": False}
     training.local_train(whole, SyntheticBatches(), CONFIG, steps=6, **common)
-    first = training.local_train(parts, SyntheticBatches(), CONFIG, steps=2, moments={}, **common)
+    first = training.local_train(parts, SyntheticBatches(), CONFIG, steps=2, start=Start(0, 6, {}), **common)
     travelled = messages.unpack_arrays(messages.pack_arrays(first.moments))  # as a client's context keeps it
-    training.local_train(parts, SyntheticBatches(), CONFIG, steps=4, start_step=2, moments=travelled, **common)
+    training.local_train(parts, SyntheticBatches(), CONFIG, steps=4, start=Start(2, 6, travelled), **common)
     assert same(weights(whole), weights(parts))
     for steps, start in ((2, 0), (4, 2)):
-        result = training.local_train(fresh, SyntheticBatches(), CONFIG, steps=steps, start_step=start, **common)
+        result = training.local_train(fresh, SyntheticBatches(), CONFIG, steps=steps, start=Start(start, 6), **common)
         assert result.moments == {}  # nobody asked for it
     assert not same(weights(whole), weights(fresh))
 
@@ -169,16 +170,18 @@ def test_a_kept_optimiser_state_makes_two_phases_equal_to_one():
 @pytest.mark.unit
 def test_a_kept_optimiser_state_survives_a_resume(tmp_path):
     bundle = model.load_policy(CONFIG, STATS)
-    before = training.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, moments={}, progress=False).moments
+    before = training.local_train(
+        bundle, SyntheticBatches(), CONFIG, steps=2, start=Start(moments={}), progress=False
+    ).moments
     started = trainable_arrays(bundle.policy)
-    settings = {"start_step": 2, "total_steps": 6, "moments": before, "progress": False}
+    settings = {"start": Start(2, 6, before), "progress": False}
     whole = training.local_train(bundle, SyntheticBatches(), CONFIG, steps=4, **settings)
     expected = weights(bundle)
     load_arrays(bundle.policy, started)
-    training.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, checkpoint_dir=tmp_path, **settings)
+    training.local_train(bundle, SyntheticBatches(), CONFIG, steps=2, checkpoints=Checkpoints(tmp_path), **settings)
     load_arrays(bundle.policy, started)
     again = training.local_train(
-        bundle, SyntheticBatches(), CONFIG, steps=4, checkpoint_dir=tmp_path, resume=True, **settings
+        bundle, SyntheticBatches(), CONFIG, steps=4, checkpoints=Checkpoints(tmp_path, resume=True), **settings
     )
     assert same(expected, weights(bundle))
     assert whole.moments and all(np.array_equal(whole.moments[key], again.moments[key]) for key in whole.moments)

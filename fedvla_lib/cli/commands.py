@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from fedvla_lib.config import Config, from_profile, task_names, to_run_config
-from fedvla_lib.evaluation.held_out import by_episode, held_out_frames
-from fedvla_lib.federation.client import Client, load_policy, open_client
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.robot.spec import CAMERAS, image_key
 
@@ -113,56 +111,30 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> None:
-    from fedvla_lib.data import normalisation
-    from fedvla_lib.policy import prefix_cache
-    from fedvla_lib.policy.model import save_policy
-    from fedvla_lib.policy.training import local_train
+    from fedvla_lib.evaluation.measure import log_measurement, measure
+    from fedvla_lib.evaluation.rollouts import rollout_seeds
+    from fedvla_lib.experiments.methods import train_alone
+    from fedvla_lib.federation.client import open_client, open_pooled
+    from fedvla_lib.policy.model import load_policy, save_policy
+    from fedvla_lib.policy.training import Checkpoints
 
-    learner = _learner(chosen, options.client)
-    bundle = load_policy(chosen, normalisation.pack_stats(learner.statistics()))
+    learner = open_pooled(chosen) if options.client is None else open_client(chosen, options.client)
+    bundle = load_policy(chosen, learner.statistics())
     steps = options.steps or chosen.num_server_rounds * chosen.local_steps
-    batches, checkpoints = prefix_cache.with_cached_prefixes(bundle, learner.batches()), folder.root / "checkpoints"
-    resume = options.resume is not None
-    result = local_train(bundle, batches, chosen, steps=steps, checkpoint_dir=checkpoints, resume=resume)
+    checkpoints = Checkpoints(folder.root / "checkpoints", resume=options.resume is not None)
+    result = train_alone(bundle, learner, steps=steps, checkpoints=checkpoints)
     save_policy(bundle, folder.root / "model")
-    frames, measured = _measure_into(folder, chosen, learner.store, bundle)
-    folder.log(0, LOCAL, "evaluate", {"gradient_steps": result.steps, "num_examples": frames, **measured})
+    found = measure(
+        bundle, learner.store, chosen, seeds=rollout_seeds(chosen.eval_rollouts),
+        videos_dir=folder.videos_dir(0, LOCAL), progress=True,
+    )  # fmt: skip
+    log_measurement(folder, 0, LOCAL, found)
+    measured = found.averages | found.success()
+    counted = {"gradient_steps": result.steps, "num_examples": found.num_examples}
+    folder.log(0, LOCAL, "evaluate", counted | measured)
     print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
-    print(f"on {frames} held-out frames: " + ", ".join(f"{name} {value:.3f}" for name, value in measured.items()))
+    print(f"on {found.num_examples} held-out frames: " + ", ".join(f"{k} {v:.3f}" for k, v in measured.items()))
     print(folder.root / "model")
-
-
-def _measure_into(folder: Any, chosen: Config, store: Any, bundle: Any) -> tuple[int, dict[str, float]]:
-    """Log held-out measurements and rollouts as a federation does of its global model, and return the averages."""
-    from fedvla_lib.data import splits
-    from fedvla_lib.evaluation import held_out, rollouts
-    from fedvla_lib.evaluation.held_out import average
-    from fedvla_lib.evaluation.rollouts import rollout_seeds, success_rate
-
-    held_out = splits.held_out_episodes(store, chosen)
-    frames = held_out_frames(bundle, store, held_out, chosen)
-    episodes = by_episode(frames, store, held_out)
-    for of_episode in episodes:
-        folder.log(0, LOCAL, "held-out", of_episode)
-    measured = average(frames) if frames else {}
-    if chosen.eval_rollouts:
-        seeds = rollout_seeds(chosen.eval_rollouts)
-        rows = rollouts.roll_out(bundle, chosen, seeds, folder.videos_dir(0, LOCAL), True)
-        for row in rows:
-            folder.log(0, LOCAL, "rollout", {**row, "video": folder.relative(row["video"])})
-        measured["success_rate"] = success_rate(rows)
-    return sum(of_episode["num_examples"] for of_episode in episodes), measured
-
-
-def _learner(chosen: Config, client: int | None) -> Any:
-    """Return the client that trains: number `client`, or one that holds everything."""
-    from fedvla_lib.data import recordings, splits
-    from fedvla_lib.federation import client
-
-    if client is not None:
-        return open_client(chosen, client)
-    store = recordings.open_frames(chosen)
-    return Client(chosen, 0, store, splits.Share(*splits.split(store, chosen.val_fraction, chosen.seed)))
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,7 +5,6 @@ client after the other in the order of their partitions. Scale comes from Flower
 """
 
 import copy
-import functools
 import logging
 import time
 import traceback
@@ -13,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import functools
 from flwr.app import Context, Error, Message, RecordDict, UserConfig
 from flwr.clientapp import ClientApp
 from flwr.common.constant import SUPERLINK_NODE_ID, ErrorCode
@@ -22,6 +22,7 @@ from flwr.supercore.task_identity import TaskIdentity
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, check, to_run_config
+from fedvla_lib.data.normalisation import pack_stats, unpack_stats
 from fedvla_lib.federation import client, client_app, server_app
 from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
 from fedvla_lib.policy.parameters import Arrays
@@ -51,20 +52,23 @@ def run_inline(
         TooFewReplies: a round had fewer good replies than `config.min_replies`; what was written so far stays.
         ValueError: settings, data or output folder that cannot be used.
     """
-    tools = cached(client.LOADERS)
-    app = clients_app or client_app.build(tools)
+    loaders = cached(client.LOADERS)
+    app = clients_app or client_app.build(loaders)
     run_config = to_run_config(check(config))
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
     claim_identity()
     with _quiet_flower():
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
-        server_app.build(tools, engine="inline", progress=progress, states=grid)(grid, context)
+        server_app.build(loaders, engine="inline", progress=progress, states=grid)(grid, context)
     return Path(context.state["run"]["folder"])
 
 
-def cached(tools: client.Loaders) -> client.Loaders:
-    """Return tools that open the frames and build the policy once and lend them to whoever asks again."""
-    return client.Loaders(functools.cache(tools.open_frames), functools.cache(tools.load_policy))
+def cached(loaders: client.Loaders) -> client.Loaders:
+    """Return loaders that open the frames and build the policy once, and share them with every client of a run."""
+    # Statistics hold arrays, which cannot be looked up by value; their text can, and keeps every bit.
+    build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
+    frames = functools.cache(loaders.open_frames)
+    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)))
 
 
 class InlineGrid(Grid):

@@ -1,24 +1,82 @@
-"""Measure one model once: held-out loss and action error, then closed-loop success."""
+"""Measure one model once: error on held-out episodes, then success in closed loop.
+
+A federated round, a pooled training, a cell of an experiment and a search all measure a model here.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import frame_store
-from fedvla_lib.evaluation import held_out
-from fedvla_lib.evaluation.held_out import held_out_frames
-from fedvla_lib.policy import model
+from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.data.splits import held_out_episodes
+from fedvla_lib.evaluation.held_out import average, by_episode, held_out_frames
+from fedvla_lib.evaluation.rollouts import roll_out, success_rate
+from fedvla_lib.policy.model import Bundle
+from fedvla_lib.run_folder import RunFolder
 
 
-def measure_held_out(
-    bundle: model.Bundle, store: frame_store.FrameStore, episode_ids: Sequence[int], config: Config
-) -> tuple[int, dict[str, float]]:
-    """Measure a policy on every fifth frame of the episodes: number of frames, and `train.measure_frames`' averages."""
-    frames = held_out_frames(bundle, store, episode_ids, config)
-    return (len(frames["loss"]), held_out.average(frames)) if frames else (0, {})
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured of one model."""
+
+    episodes: list[dict[str, float]]  # of each held-out episode: episode_id, num_examples (frames) and averages
+    averages: dict[str, float]  # over all held-out frames, see `held_out.measure_frames`; empty without episodes
+    rollouts: list[dict[str, Any]]  # rows of `rollouts.evaluate`
+
+    @property
+    def num_examples(self) -> int:
+        """Held-out frames measured."""
+        return sum(episode["num_examples"] for episode in self.episodes)
+
+    def success(self) -> dict[str, float]:
+        """Return the success rate; nothing without rollouts."""
+        return {"success_rate": success_rate(self.rollouts)} if self.rollouts else {}
+
+    def success_by_task(self, tasks: Sequence[str]) -> dict[str, float]:
+        """Return the success rate of each task; nothing without rollouts."""
+        by_task = {task: [row for row in self.rollouts if row["task"] == task] for task in tasks}
+        return {f"success_rate.{task}": success_rate(rows) for task, rows in by_task.items() if rows}
+
+
+def measure(
+    bundle: Bundle,
+    store: FrameStore,
+    config: Config,
+    *,
+    episode_ids: Sequence[int] | None = None,
+    seeds: Sequence[int] = (),
+    videos_dir: Path | None = None,
+    progress: bool = False,
+) -> Measurement:
+    """Measure a model on held-out episodes and, with `seeds`, in one rollout for each task of the mix and seed.
+
+    Args:
+        episode_ids: episodes to measure on; None takes all that are held out.
+        videos_dir: where videos of the rollouts go; None records none.
+    """
+    ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
+    frames = held_out_frames(bundle, store, ids, config)
+    rows = roll_out(bundle, config, seeds, videos_dir, progress) if len(seeds) else []
+    return Measurement(by_episode(frames, store, ids), average(frames) if frames else {}, rows)
+
+
+def log_measurement(run: RunFolder, round_number: int, who: str, found: Measurement) -> None:
+    """Write a measurement to a run: an event for each held-out episode and each rollout."""
+    for episode in found.episodes:
+        run.log(round_number, who, "held-out", episode)
+    log_rollouts(run, round_number, who, found.rollouts)
+
+
+def log_rollouts(run: RunFolder, round_number: int, who: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Write an event for each rollout; paths of videos become relative to the run folder."""
+    for row in rows:
+        run.log(round_number, who, "rollout", {**row, "video": run.relative(row["video"])})
 
 
 def is_validated(config: Config, round_number: int) -> bool:
-    """Whether the global model of a round is kept and measured: every `validate_every` rounds, and whenever it acts."""
+    """Whether a round's global model is kept and measured: every `validate_every` rounds, and before rollouts."""
     return round_number % config.validate_every == 0 or rolls_out(config, round_number)
 
 

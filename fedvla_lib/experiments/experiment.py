@@ -22,8 +22,6 @@
     partition = "by_task"
 """
 
-import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -35,9 +33,8 @@ import pandas as pd
 
 from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config
-from fedvla_lib.data import recordings, splits
-from fedvla_lib.evaluation import rollouts
-from fedvla_lib.evaluation.held_out import average, by_episode, held_out_frames
+from fedvla_lib.data import recordings
+from fedvla_lib.evaluation import measure
 from fedvla_lib.experiments import methods
 from fedvla_lib.experiments.plan import Cell, Plan
 from fedvla_lib.federation.nodes import client_name
@@ -76,18 +73,15 @@ def measure_cell(cell: Cell, seeds: Sequence[int], out: Path) -> float:
     config, began = with_recording(cell.config), time.perf_counter()
     stamp = provenance.first_stamp(cell.config, cell.kind)
     found = MEASURES[cell.kind](config, seeds)
-    scratch = RunFolder(out / f".{cell.name}.{os.getpid()}")
-    shutil.rmtree(scratch.root, ignore_errors=True)
-    scratch.root.mkdir()
     steps = sum(of_model["in_all"] for of_model in found.steps.values())
-    files.write_json(scratch.root / "config.json", asdict(cell.config))
-    _log(scratch, found, 0 if cell.kind == "base" else config.num_server_rounds, steps)
     known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "steps": found.steps,
              "gradient_steps": steps, "samples": steps * config.batch_size, "bytes": found.bytes,
              "train_s": found.train_s}  # fmt: skip
     ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": methods.trained_by()}
-    files.write_json(scratch.root / "stamp.json", stamp | ended | known)
-    os.replace(scratch.root, out / cell.name)
+    with files.new_folder(out / cell.name) as draft:
+        files.write_json(draft / "config.json", asdict(cell.config))
+        _log(RunFolder(draft), found, 0 if cell.kind == "base" else config.num_server_rounds, steps)
+        files.write_json(draft / "stamp.json", stamp | ended | known)
     return sum(row["success"] for row in found.rows) / len(found.rows)
 
 
@@ -116,7 +110,7 @@ def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
 def _federated(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure the last global model; what the run measured of earlier ones is kept, videos left out."""
     folder = methods.federated(config, progress=False)
-    events = [event for event in run_folder.read_events(folder / "metrics.jsonl") if event["who"] == GLOBAL]
+    events = [event for event in run_folder.read_events(folder) if event["who"] == GLOBAL]
     earlier = [event for event in events if event["round"] < config.num_server_rounds]
     for event in earlier:
         event["values"].pop("video", None)
@@ -156,12 +150,9 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
 
 def _of_model(bundle: Bundle, config: Config, seeds: Sequence[int]) -> Measured:
     """Measure one model on all held-out episodes and all tasks."""
-    store = recordings.open_frames(config)
-    held_out = splits.held_out_episodes(store, config)
-    frames = held_out_frames(bundle, store, held_out, config)
-    episodes = by_episode(frames, store, held_out) if frames else []
-    averages = {"num_examples": len(frames["loss"]), **average(frames)} if frames else {}
-    return Measured(rollouts.roll_out(bundle, config, seeds) if len(seeds) else [], averages, episodes)
+    found = measure.measure(bundle, recordings.open_frames(config), config, seeds=seeds)
+    averages = {"num_examples": found.num_examples, **found.averages} if found.episodes else {}
+    return Measured(found.rollouts, averages, found.episodes)
 
 
 def _clients(config: Config, seeds: Sequence[int]) -> Measured:

@@ -9,20 +9,18 @@ found again by settings and by the code that decides them, so that a change of e
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock
 
 from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config
-from fedvla_lib.data import normalisation, recordings, splits
-from fedvla_lib.data.splits import Share
+from fedvla_lib.data import normalisation
 from fedvla_lib.engines import inline
-from fedvla_lib.federation.client import Client, load_policy, open_client
+from fedvla_lib.federation.client import Client, open_client, open_pooled
 from fedvla_lib.federation.nodes import draw_size
 from fedvla_lib.files import cache_dir
 from fedvla_lib.policy import model, nano, prefix_cache
@@ -66,12 +64,13 @@ def federated_policy(config: Config) -> model.Bundle:
 
 def base(config: Config) -> model.Bundle:
     """Return the model every arm starts from, with the normalisation of the pooled training episodes."""
-    return load_policy(config, _pooled_stats(config))
+    pooled = normalisation.common_statistics(config, open_pooled(config).statistics())
+    return model.load_policy(config, pooled)
 
 
 def centralized(config: Config, progress: bool = True) -> model.Bundle:
     """Train on all clients' training episodes for the steps that all clients do together."""
-    whole = _everything(config)
+    whole = open_pooled(config)
     return _kept(config, CENTRALIZED, lambda: _train(config, whole, total_steps(config), progress))
 
 
@@ -109,8 +108,13 @@ def _alone_name(partition_id: int) -> str:
 
 def _train(config: Config, client: Client, steps: int, progress: bool) -> tuple[model.Bundle, TrainResult]:
     bundle = base(config)
+    return bundle, train_alone(bundle, client, steps=steps, progress=progress)
+
+
+def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **how: Any) -> TrainResult:
+    """Train a policy in place on one client's episodes; `how` goes to `local_train`."""
     batches = prefix_cache.with_cached_prefixes(bundle, client.batches())
-    return bundle, local_train(bundle, batches, config, steps=steps, progress=progress)
+    return local_train(bundle, batches, client.config, steps=steps, **how)
 
 
 def _kept(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
@@ -123,12 +127,10 @@ def _kept(config: Config, name: str, train: Callable[[], tuple[model.Bundle, Tra
 
 
 def _keep(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
-    """Write the model and, beside it, the steps that it took; both are there before the folder appears."""
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".keeping-") as scratch:
-        made = Path(scratch) / "policy"
-        model.save_policy(bundle, made)
-        files.write_json(made / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
-        os.replace(made, folder)
+    """Write the model and, beside it, the steps that it took."""
+    with files.new_folder(folder) as draft:
+        model.write_policy(bundle, draft)
+        files.write_json(draft / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
 
 
 def _place(config: Config, name: str) -> Path:
@@ -139,18 +141,6 @@ def _alone(kept: Path) -> FileLock:
     """A lock beside what is kept: of two chapters that want the same model, the second waits and trains nothing."""
     kept.parent.mkdir(parents=True, exist_ok=True)
     return FileLock(kept.with_name(f"{kept.name}.lock"))
-
-
-def _everything(config: Config) -> Client:
-    """One client with every training episode and client 0's random stream: of one client, all arms learn the same."""
-    store = recordings.open_frames(config)
-    train_ids, val_ids = splits.split(store, config.val_fraction, config.seed)
-    return Client(config, 0, store, Share(train_ids, val_ids))
-
-
-def _pooled_stats(config: Config) -> str:
-    """The statistics a federation pools, computed from all training episodes at once: they are equal."""
-    return normalisation.pack_stats(normalisation.common_statistics(config, _everything(config).statistics()))
 
 
 def trained_by() -> str:

@@ -165,7 +165,7 @@ def _loss(bundle: Bundle, config: Config, half: int) -> float:
     """Held-out loss on every second validation episode, from the first or from the second on."""
     store = recordings.open_frames(config)
     episodes = splits.held_out_episodes(store, config)[half::2]
-    return measure.measure_held_out(bundle, store, episodes, config)[1]["loss"]
+    return measure.measure(bundle, store, config, episode_ids=episodes).averages["loss"]
 
 
 def _open(config: Config, out: Path) -> optuna.Study:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import frame_store, normalisation, splits
+from fedvla_lib.data import frame_store, splits
 from fedvla_lib.data.batches import Batches
-from fedvla_lib.data.normalisation import unpack_stats
+from fedvla_lib.data.normalisation import Stats, episode_stats
 from fedvla_lib.data.recordings import open_frames
 from fedvla_lib.data.splits import Share, labs_of, num_frames, shares, tasks_of
-from fedvla_lib.evaluation.measure import measure_held_out
+from fedvla_lib.evaluation.measure import measure
 from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.policy import model, prefix_cache, training
 from fedvla_lib.policy.actor import PolicyActor
@@ -35,15 +35,10 @@ class Loaders:
     """
 
     open_frames: Callable[[Config], frame_store.FrameStore]
-    load_policy: Callable[[Config, str], model.Bundle]  # settings, statistics as JSON text
+    load_policy: Callable[[Config, Stats], model.Bundle]  # settings, statistics to normalise with
 
 
-def load_policy(config: Config, stats_text: str) -> model.Bundle:
-    """Build the policy that normalises with the given statistics."""
-    return model.load_policy(config, unpack_stats(stats_text))
-
-
-LOADERS = Loaders(open_frames, load_policy)
+LOADERS = Loaders(open_frames, model.load_policy)
 
 
 @dataclass(frozen=True)
@@ -60,9 +55,9 @@ class Client:
         """Training frames: the client's weight."""
         return num_frames(self.store, self.share.train_ids)
 
-    def statistics(self) -> normalisation.Stats:
+    def statistics(self) -> Stats:
         """Mean, standard deviation, range and count of state and action over the client's training episodes."""
-        return normalisation.episode_stats(self.store, self.share.train_ids)
+        return episode_stats(self.store, self.share.train_ids)
 
     def train(
         self,
@@ -83,11 +78,11 @@ class Client:
             prefix_cache.with_cached_prefixes(bundle, self.batches()),
             config,
             steps=config.local_steps,
-            start_step=(round_number - 1) * config.local_steps,
-            total_steps=config.num_server_rounds * config.local_steps,
+            start=training.Start(
+                (round_number - 1) * config.local_steps, config.num_server_rounds * config.local_steps, moments
+            ),
+            objective=training.Objective(correction=correction),
             progress=False,
-            correction=correction,
-            moments=moments,
         )
 
     def batches(self) -> Batches:
@@ -99,7 +94,8 @@ class Client:
 
     def validate(self, bundle: model.Bundle) -> tuple[int, dict[str, float]]:
         """Return the held-out frames measured and the measurements; 0 and none without held-out episodes."""
-        return measure_held_out(bundle, self.store, self.share.val_ids, self.config)
+        found = measure(bundle, self.store, self.config, episode_ids=self.share.val_ids)
+        return found.num_examples, found.averages
 
     def roll_out(self, bundle: model.Bundle, videos_dir: Path) -> list[dict[str, Any]]:
         """Let the policy act on the tasks that the client holds, in turn; videos go to `videos_dir`.
@@ -121,7 +117,7 @@ class Client:
         return rows
 
 
-def open_client(config: Config, partition_id: int, tools: Loaders = LOADERS, own_data: str = "") -> Client:
+def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, own_data: str = "") -> Client:
     """Return client `partition_id` with its episodes: a part of the run's data set, or all of one that is its own.
 
     Args:
@@ -136,11 +132,18 @@ def open_client(config: Config, partition_id: int, tools: Loaders = LOADERS, own
             f"{config.num_clients - 1}): start as many SuperNodes as num-clients says"
         )
     if own_data:
-        config = replace(config, data=own_data)
-        store = tools.open_frames(config)
-        return Client(config, partition_id, store, Share(*splits.split(store, config.val_fraction, config.seed)))
-    store = tools.open_frames(config)
+        return open_pooled(replace(config, data=own_data), loaders, partition_id)
+    store = loaders.open_frames(config)
     return Client(config, partition_id, store, shares(store, config)[partition_id])
+
+
+def open_pooled(config: Config, loaders: Loaders = LOADERS, partition_id: int = 0) -> Client:
+    """Return one client that holds all training episodes of a data set: pooled training, or a lab with its own data.
+
+    Its random stream is that of client `partition_id`: with one client, all methods learn the same.
+    """
+    store = loaders.open_frames(config)
+    return Client(config, partition_id, store, Share(*splits.split(store, config.val_fraction, config.seed)))
 
 
 def client_seed(seed: int, partition_id: int) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.clientapp.typing import Mod
 
@@ -31,7 +31,7 @@ OWN = "own"  # the parts of the model that are personal
 LEFT_OVER = "left-over"  # of its changes, what rounding has kept from the server so far
 
 
-def build(tools: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
+def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
     """Return the ClientApp with handlers for query (statistics), train and evaluate.
 
     Args:
@@ -41,56 +41,64 @@ def build(tools: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
-        client = _client(context, tools)
-        answer = messages.make_note(
-            partition_id=client.partition_id,
-            num_examples=client.num_examples,
-            stats=normalisation.pack_stats(client.statistics()),
-        )
-        return Message(RecordDict({messages.NOTE: answer}), reply_to=message)
+        return Message(_introduction(_client(context, loaders)), reply_to=message)
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
-        client = _client(context, tools)
-        bundle = _policy(client, message, tools, context)
-        order, exchange = message.content[messages.CONFIG], client.config.exchange
-        start = {} if exchange == "float32" else bundle.shared_arrays()  # needed only to send the change
-        correction = correction_for(message, context, bundle.shared())
-        moments = _load_state(context, MOMENTS) if client.config.keep_optimizer else None
-        result = client.train(bundle, order[messages.ROUND], correction, moments)
-        arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
-        metrics = {
-            messages.EXAMPLES: result.num_examples,
-            messages.STEPS: result.steps,
-            "loss": sum(result.losses) / len(result.losses),
-            "seconds": result.seconds,
-        }
-        records = {
-            messages.ARRAYS: messages.pack_arrays(arrays),
-            messages.METRICS: MetricRecord(metrics),
-            messages.NOTE: messages.make_note(sha256=digest(arrays)),
-        }
-        content = RecordDict(records)
-        attach_control_variates(content, correction, context)
-        if client.config.keep_optimizer:
-            context.state[MOMENTS] = messages.pack_arrays(result.moments)
-        if bundle.own:
-            trained = trainable_arrays(bundle.policy)
-            context.state[OWN] = messages.pack_arrays({name: trained[name] for name in bundle.own})
-        return Message(content, reply_to=message)
+        client = _client(context, loaders)
+        bundle = _policy(client, message, loaders, context)
+        return Message(_trained(client, bundle, message, context), reply_to=message)
 
     @app.evaluate()
     def evaluate(message: Message, context: Context) -> Message:
-        client = _client(context, tools)
-        bundle = _policy(client, message, tools, context)
-        examples, metrics = client.validate(bundle)
-        content = {
-            messages.METRICS: MetricRecord({messages.EXAMPLES: examples, **metrics}),
-            messages.NOTE: _rollouts(client, bundle, message.content[messages.CONFIG][messages.ROUND]),
-        }
-        return Message(RecordDict(content), reply_to=message)
+        client = _client(context, loaders)
+        bundle = _policy(client, message, loaders, context)
+        return Message(_evaluated(client, bundle, message.content[messages.CONFIG][messages.ROUND]), reply_to=message)
 
     return app
+
+
+def _introduction(client: Client) -> RecordDict:
+    stats = normalisation.pack_stats(client.statistics())
+    note = messages.make_note(partition_id=client.partition_id, num_examples=client.num_examples, stats=stats)
+    return RecordDict({messages.NOTE: note})
+
+
+def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:
+    """Train for one round, keep what the client keeps between rounds, and return the reply's content."""
+    exchange, keeps_moments = client.config.exchange, client.config.keep_optimizer
+    start = {} if exchange == "float32" else bundle.shared_arrays()  # needed only to send the change
+    correction = correction_for(message, context, bundle.shared())
+    moments = _load_state(context, MOMENTS) if keeps_moments else None
+    result = client.train(bundle, message.content[messages.CONFIG][messages.ROUND], correction, moments)
+    arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
+    metrics = {
+        messages.EXAMPLES: result.num_examples,
+        messages.STEPS: result.steps,
+        "loss": sum(result.losses) / len(result.losses),
+        "seconds": result.seconds,
+    }
+    content = RecordDict({
+        messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: MetricRecord(metrics),
+        messages.NOTE: messages.make_note(sha256=digest(arrays)),
+    })  # fmt: skip
+    attach_control_variates(content, correction, context)
+    if keeps_moments:
+        context.state[MOMENTS] = messages.pack_arrays(result.moments)
+    if bundle.own:
+        trained = trainable_arrays(bundle.policy)
+        context.state[OWN] = messages.pack_arrays({name: trained[name] for name in bundle.own})
+    return content
+
+
+def _evaluated(client: Client, bundle: Bundle, round_number: int) -> RecordDict:
+    examples, metrics = client.validate(bundle)
+    with tempfile.TemporaryDirectory() as folder:
+        due = measure.rolls_out(client.config, round_number)
+        rollouts = messages.pack_rollouts(client.roll_out(bundle, Path(folder)) if due else [], Path(folder))
+    return RecordDict({
+        messages.METRICS: MetricRecord({messages.EXAMPLES: examples, **metrics}), messages.NOTE: rollouts,
+    })  # fmt: skip
 
 
 def reserved_cards() -> list[str]:
@@ -113,12 +121,12 @@ def on_reserved_card(config: Config, cards: Sequence[str]) -> Config:
     return replace(config, device="cuda") if cards and config.device == Config.device else config
 
 
-def _client(context: Context, tools: Loaders) -> Client:
+def _client(context: Context, loaders: Loaders) -> Client:
     config = on_reserved_card(from_run_config(context.run_config), reserved_cards())
     if messages.PARTITION not in context.node_config:
         raise ValueError(f"this node has no {messages.PARTITION}: start it with --node-config 'partition-id=K'")
     own_data = str(context.node_config.get(messages.DATA, ""))
-    return open_client(config, int(context.node_config[messages.PARTITION]), tools, own_data)
+    return open_client(config, int(context.node_config[messages.PARTITION]), loaders, own_data)
 
 
 def correction_for(message: Message, context: Context, parameters: Parameters) -> Correction | None:
@@ -164,11 +172,12 @@ def _load_state(context: Context, what: str) -> Arrays:
     return messages.unpack_arrays(context.state[what]) if what in context.state else {}
 
 
-def _policy(client: Client, message: Message, tools: Loaders, context: Context) -> Bundle:
+def _policy(client: Client, message: Message, loaders: Loaders, context: Context) -> Bundle:
     """Return the policy holding the global arrays of the message, once they have passed every check, and its own."""
     own = client.config.normalisation == "own"
-    stats = normalisation.pack_stats(client.statistics()) if own else message.content[messages.CONFIG][messages.STATS]
-    bundle = tools.load_policy(client.config, stats)
+    sent = message.content[messages.CONFIG][messages.STATS]
+    stats = client.statistics() if own else normalisation.unpack_stats(sent)
+    bundle = loaders.load_policy(client.config, stats)
     exchange = DOWNWARD[client.config.exchange]
     shapes = shapes_of(bundle.shared())
     arrays = messages.checked_arrays(
@@ -176,12 +185,6 @@ def _policy(client: Client, message: Message, tools: Loaders, context: Context) 
     )
     load_arrays(bundle.policy, arrays | (_load_state(context, OWN) or bundle.own))
     return bundle
-
-
-def _rollouts(client: Client, bundle: Bundle, round_number: int) -> ConfigRecord:
-    with tempfile.TemporaryDirectory() as folder:
-        due = measure.rolls_out(client.config, round_number)
-        return messages.pack_rollouts(client.roll_out(bundle, Path(folder)) if due else [], Path(folder))
 
 
 app = build()

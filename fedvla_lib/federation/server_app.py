@@ -5,17 +5,17 @@ The run folder's place is left in ``context.state["run"]["folder"]`` for whoever
 
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Protocol
 
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
 
 from fedvla_lib import files, run_folder
 from fedvla_lib.config import Config, from_run_config, task_names
-from fedvla_lib.data import frame_store, normalisation, splits
+from fedvla_lib.data import frame_store, normalisation
 from fedvla_lib.evaluation import measure
-from fedvla_lib.evaluation.held_out import average, by_episode, held_out_frames
-from fedvla_lib.evaluation.rollouts import roll_out, rollout_seeds, success_rate
+from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, client, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.messages import Rollouts
@@ -42,7 +42,7 @@ class ClientStates(Protocol):
 
 
 def build(
-    tools: client.Loaders = client.LOADERS,
+    loaders: client.Loaders = client.LOADERS,
     *,
     engine: str = "flower",
     progress: bool = False,
@@ -62,7 +62,7 @@ def build(
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(for_simulation(grid), config, run, tools, progress, states)
+            federate(for_simulation(grid), config, run, loaders, progress, states)
 
     return app
 
@@ -71,7 +71,7 @@ def federate(
     grid: Grid,
     config: Config,
     run: RunFolder,
-    tools: client.Loaders,
+    loaders: client.Loaders,
     progress: bool,
     states: ClientStates | None = None,
 ) -> None:
@@ -83,39 +83,29 @@ def federate(
     """
     check_tasks(task_names(config))
     before = _before(config, run, states)
-    store = tools.open_frames(config)  # before any client: many of them must not record the same data at once
-    members, weights, pooled = _introduce(grid, config, run)
+    store = loaders.open_frames(config)  # before any client: many of them must not record the same data at once
+    roster, weights, pooled = _introduce(grid, config, run)
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.judging_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
     if before:  # in the order of the model, which is not that of the file
         arrays, done = {name: before.arrays[name] for name in arrays}, before.round
     strategy = build_strategy(
-        config,
-        weights,
-        roster=members,
-        shapes=shapes_of(arrays),
-        report=run.log,
-        keep_rollouts=lambda round_number, who, rollouts: _keep_rollouts(run, round_number, who, rollouts),
-        train_share=config.fraction_train,
-        evaluate_share=config.fraction_evaluate,
-        min_replies=config.min_replies,
-        seed=config.seed,
-        exchange=config.exchange,
-        clip_norm=config.clip_norm,
-        rounds_done=done,
-    )
+        config, weights, roster=roster, shapes=shapes_of(arrays), report=run.log,
+        keep_rollouts=partial(_keep_rollouts, run), rounds_done=done,
+    )  # fmt: skip
     if before:
         strategy.remember(checkpoint.nested(before.strategy))
-    judge = GlobalEvaluator(config, store, bundle, run, progress)
+    evaluator = GlobalEvaluator(config, store, bundle, run, progress)
+    packed = normalisation.pack_stats(stats)
     strategy.start(
         grid,
         messages.pack_arrays(arrays),
         num_rounds=config.num_server_rounds - done,
         timeout=config.round_timeout_s,
-        train_config=ConfigRecord({messages.STATS: normalisation.pack_stats(stats)}),
-        evaluate_config=ConfigRecord({messages.STATS: normalisation.pack_stats(stats)}),
-        evaluate_fn=RoundEnd(judge, strategy, run, states, done),
+        train_config=ConfigRecord({messages.STATS: packed}),
+        evaluate_config=ConfigRecord({messages.STATS: packed}),
+        evaluate_fn=RoundEnd(evaluator, strategy, run, states, done),
     )
 
 
@@ -123,7 +113,7 @@ def federate(
 class RoundEnd:
     """Judges the model of a round, then keeps all that the next one needs. Flower calls it first for round 0."""
 
-    judge: "GlobalEvaluator"
+    evaluator: "GlobalEvaluator"
     strategy: checked.Checked
     run: RunFolder
     states: ClientStates | None
@@ -134,7 +124,7 @@ class RoundEnd:
         if self.done and flowers_round == 0:
             return None
         number = self.done + flowers_round
-        measured = self.judge(number, record)
+        measured = self.evaluator(number, record)
         memory, kept = self.strategy.memory(), self.states.client_states() if self.states else {}
         arrays = messages.unpack_arrays(record)
         checkpoint.save(self.run.root, Checkpoint(number, arrays, checkpoint.flat(memory), checkpoint.flat(kept)))
@@ -178,30 +168,17 @@ class GlobalEvaluator:
         started = time.perf_counter()
         load_arrays(self.bundle.policy, messages.unpack_arrays(arrays) | self.bundle.own)
         model.save_policy(self.bundle, self.run.model_dir(round_number))
-        held_out = splits.held_out_episodes(self.store, self.config)
-        frames = held_out_frames(self.bundle, self.store, held_out, self.config)
-        episodes = by_episode(frames, self.store, held_out)
-        for of_episode in episodes:
-            self.run.log(round_number, GLOBAL, "held-out", of_episode)
-        values = (average(frames) if frames else {}) | self._roll_out(round_number)
-        counted = {"num_examples": sum(of_episode["num_examples"] for of_episode in episodes)}
+        due = measure.rolls_out(self.config, round_number)
+        found = measure.measure(
+            self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
+            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress,
+        )  # fmt: skip
+        measure.log_measurement(self.run, round_number, GLOBAL, found)
+        values = found.averages | found.success() | found.success_by_task(task_names(self.config))
         seconds = time.perf_counter() - started
+        counted = {"num_examples": found.num_examples}
         self.run.log(round_number, GLOBAL, "evaluate", {**counted, **values, "seconds": seconds})
         return MetricRecord(values)
-
-    def _roll_out(self, round_number: int) -> dict[str, float]:
-        """Return the success rate over all tasks and of each, when rollouts are due."""
-        config = self.config
-        if not config.eval_rollouts or not measure.rolls_out(config, round_number):
-            return {}
-        videos_dir = self.run.videos_dir(round_number, GLOBAL)
-        seeds = rollout_seeds(config.eval_rollouts)
-        rows = roll_out(self.bundle, config, seeds, videos_dir, self.progress)
-        _log_rollouts(self.run, round_number, GLOBAL, rows)
-        by_task = {task: [row for row in rows if row["task"] == task] for task in task_names(config)}
-        return {"success_rate": success_rate(rows)} | {
-            f"success_rate.{task}": success_rate(of_task) for task, of_task in by_task.items()
-        }
 
 
 def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
@@ -210,7 +187,7 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict
     Nothing else about the data leaves a client. Returns the roster, each node's share of all frames, the statistics.
     """
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    members, introductions = call(grid, nodes, run.log, config.round_timeout_s)
+    roster, introductions = call(grid, nodes, run.log, config.round_timeout_s)
     if len(introductions) < config.min_replies:
         raise TooFewReplies(
             f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
@@ -219,8 +196,8 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict
     for one in introductions if not config.resume else []:
         run.log(0, client_name(one.partition_id), "data", {"num_examples": one.num_examples})
     whole = sum(one.num_examples for one in introductions)
-    weights = {node: one.num_examples / whole for node, one in zip(members.partition_of, introductions, strict=True)}
-    return members, weights, normalisation.pool_stats([one.stats for one in introductions])
+    weights = {node: one.num_examples / whole for node, one in zip(roster.partition_of, introductions, strict=True)}
+    return roster, weights, normalisation.pool_stats([one.stats for one in introductions])
 
 
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:
@@ -229,13 +206,9 @@ def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollou
     for name, content in rollouts.files.items():
         folder.mkdir(parents=True, exist_ok=True)
         files.write_atomically(folder / name, content)
-    _log_rollouts(run, round_number, who, [{**row, "video": str(folder / row["video"])} for row in rollouts.rows])
-
-
-def _log_rollouts(run: RunFolder, round_number: int, who: str, rows: list[dict[str, Any]]) -> None:
-    for row in rows:
-        video = run.relative(row["video"])
-        run.log(round_number, who, "rollout", {**row, "video": video})
+    measure.log_rollouts(
+        run, round_number, who, [{**row, "video": str(folder / row["video"])} for row in rollouts.rows]
+    )
 
 
 app = build()

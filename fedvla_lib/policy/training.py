@@ -1,13 +1,10 @@
-"""Local training and validation of one policy: what a client does between two messages.
+"""Local training of one policy: what a client does in a round, and what a training in one place does.
 
 Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's own flow-matching loss with
 padded actions masked.
 """
 
 import json
-import os
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +20,7 @@ from safetensors.torch import load_file, save_file
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, granted_threads
-from fedvla_lib.files import safetensors_errors_named
+from fedvla_lib.files import new_folder
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.policy.parameters import Arrays, trainable
 from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
@@ -66,55 +63,69 @@ class TrainResult:
     moments: Arrays = field(default_factory=dict)  # the optimiser's state by name, for who goes on from here
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a call of `local_train` begins within a longer training."""
+
+    step: int = 0  # steps done in earlier rounds: the place in the data and in the learning-rate schedule
+    total_steps: int | None = None  # length of the schedule; None lets it end with the call
+    moments: Arrays | None = None  # optimiser state of an earlier result; {} starts fresh and still returns it
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """Where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end."""
+
+    folder: Path
+    resume: bool = False  # continue from the newest one; the result is bit for bit the same
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is minimised."""
+
+    loss: Loss | None = None  # None: the policy's own flow-matching loss
+    correction: Correction | None = None  # changes each gradient before it is clipped: FedProx, SCAFFOLD
+
+
+FRESH, FLOW_MATCHING = Start(), Objective()
+
+
 def local_train(
     bundle: Bundle,
     batches: TrainingBatches,
     config: Config,
     *,
     steps: int,
-    start_step: int = 0,
-    total_steps: int | None = None,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
+    start: Start = FRESH,
+    checkpoints: Checkpoints | None = None,
+    objective: Objective = FLOW_MATCHING,
     progress: bool = True,
-    loss: Loss | None = None,
-    correction: Correction | None = None,
-    moments: Arrays | None = None,
 ) -> TrainResult:
-    """Train the policy's trainable parameters in place for `steps` steps, from `start_step` of a schedule.
-
-    Args:
-        start_step: steps done in earlier rounds; sets the place in the data and in the learning-rate schedule.
-        total_steps: length of the schedule; default `start_step + steps`.
-        checkpoint_dir: where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end.
-        resume: continue from the newest checkpoint in `checkpoint_dir`; the result is bit for bit the same.
-        loss: what to minimise; default the policy's own flow-matching loss.
-        correction: changes each gradient before it is clipped: FedProx, SCAFFOLD.
-        moments: the optimiser's state to go on from, as an earlier result has it; ``{}`` starts afresh and still
-            returns the state, None does neither.
+    """Train the policy's trainable parameters in place for `steps` optimiser steps.
 
     Raises:
         FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
     """
     torch.set_num_threads(granted_threads(config))
-    started = time.perf_counter()
-    with _seeded(batches.seed, start_step):
-        optimizer, scheduler = _optimizer(bundle, config, start_step, total_steps or start_step + steps)
-        _load_moments(bundle, optimizer, moments or {})
-        losses = _restore(bundle, optimizer, scheduler, checkpoint_dir) if resume else []
+    began, loss = time.perf_counter(), objective.loss or flow_loss
+    with _seeded(batches.seed, start.step):
+        optimizer, scheduler = _optimizer(bundle, config, start.step, start.total_steps or start.step + steps)
+        _load_moments(bundle, optimizer, start.moments or {})
+        losses = _restore(bundle, optimizer, scheduler, checkpoints)
         bundle.policy.train()
         bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
         for step in bar:
-            value = (loss or flow_loss)(bundle, batches.at(start_step + step))
-            losses.append(_step(bundle, value, optimizer, scheduler, correction))
+            value = loss(bundle, batches.at(start.step + step))
+            losses.append(_step(bundle, value, optimizer, scheduler, objective.correction))
             if not np.isfinite(losses[-1]):
-                raise FloatingPointError(f"loss is {losses[-1]} at step {start_step + step}: lower lr={config.lr}")
+                raise FloatingPointError(f"loss is {losses[-1]} at step {start.step + step}: lower lr={config.lr}")
             bar.set_postfix(loss=f"{losses[-1]:.3f}")
-            if checkpoint_dir and _is_due(step + 1, steps, config.checkpoint_every):
-                _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoint_dir))
+            if checkpoints and _is_due(step + 1, steps, config.checkpoint_every):
+                _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoints.folder))
         bundle.policy.eval()
-        after = {} if moments is None else _moments(bundle, optimizer)
-    return TrainResult(losses, batches.num_examples, len(losses), time.perf_counter() - started, after)
+        after = {} if start.moments is None else _moments(bundle, optimizer)
+    return TrainResult(losses, batches.num_examples, len(losses), time.perf_counter() - began, after)
 
 
 def _step(
@@ -204,21 +215,16 @@ def _is_due(done: int, steps: int, every: int) -> bool:
 
 def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[float], folder: Path) -> None:
     """Write ``step_NNNNNN`` whole or not at all: weights, optimiser, schedule, random state, losses."""
-    target = folder / f"step_{len(losses):06d}"
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch, safetensors_errors_named(target):
-        made = Path(scratch) / "checkpoint"
-        save_training_state(made, len(losses), optimizer, scheduler)
+    with new_folder(folder / f"step_{len(losses):06d}", replace=True) as draft:
+        save_training_state(draft, len(losses), optimizer, scheduler)
         weights = {name: p.detach().contiguous() for name, p in trainable(bundle.policy).items()}
-        save_file(weights, made / WEIGHTS_FILE)
-        (made / LOSSES_FILE).write_text(json.dumps(losses))
-        shutil.rmtree(target, ignore_errors=True)
-        os.replace(made, target)
+        save_file(weights, draft / WEIGHTS_FILE)
+        (draft / LOSSES_FILE).write_text(json.dumps(losses))
 
 
-def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, folder: Path | None) -> list[float]:
-    """Load the newest checkpoint in place and return the losses so far; an empty list when there is none."""
-    found = sorted(Path(folder).glob("step_*")) if folder else []
+def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, checkpoints: Checkpoints | None) -> list[float]:
+    """Load the newest checkpoint in place and return the losses so far; an empty list when there is none to resume."""
+    found = sorted(Path(checkpoints.folder).glob("step_*")) if checkpoints and checkpoints.resume else []
     if not found:
         return []
     load_training_state(found[-1], optimizer, scheduler)

@@ -28,7 +28,7 @@ from fedvla_lib.files import cache_dir, new_folder, write_json
 from fedvla_lib.policy import model, nano
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.prefix_cache import with_cached_prefixes
-from fedvla_lib.policy.training import local_train
+from fedvla_lib.policy.training import Checkpoints, Objective, local_train
 from fedvla_lib.pretraining.grounding import Questions, grounding_loss, pointing_error_m, probing
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.pretraining.scenes import draw_scenes
@@ -84,7 +84,7 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     batches = Batches(store, episodes, config.chunk_size, recipe.batch_size, seed=recipe.seed)
     result = local_train(
         bundle, with_cached_prefixes(bundle, batches, progress), config, steps=recipe.steps,
-        checkpoint_dir=work / "checkpoints", resume=True, progress=progress,
+        checkpoints=Checkpoints(work / "checkpoints", resume=True), progress=progress,
     )  # fmt: skip
     account = {
         "recipe": asdict(recipe),
@@ -119,7 +119,7 @@ def ground(
     with probing(bundle, recipe.seed):
         result = local_train(
             bundle, Questions(scenery, bundle, recipe.batch_size, recipe.seed), config, steps=recipe.grounding_steps,
-            checkpoint_dir=work / "grounding", resume=True, progress=progress, loss=grounding_loss,
+            checkpoints=Checkpoints(work / "grounding", resume=True), objective=Objective(grounding_loss), progress=progress,
         )  # fmt: skip
         missed_m = pointing_error_m(bundle, Questions(unseen, bundle, recipe.batch_size, recipe.seed))
     return bundle, {

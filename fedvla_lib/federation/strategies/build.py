@@ -24,19 +24,17 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
 
     Args:
         weights: each node's share of all training frames.
-        **checked: what `Checked` takes.
+        **checked: what `Checked` takes beside the settings.
     """
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
-    if config.strategy == "fedprox":
-        return CheckedFedProx(proximal_mu=config.proximal_mu, **checked)
-    if config.strategy == "fedavgm":
-        return CheckedFedAvgM(server_learning_rate=rate, server_momentum=config.server_momentum, **checked)
-    if config.strategy == "fedadam":
-        return CheckedFedAdam(eta=rate, tau=ADAPTIVITY, **checked)
-    if config.strategy == "fedyogi":
-        return CheckedFedYogi(eta=rate, tau=ADAPTIVITY, **checked)
-    if config.strategy == "krum":
-        return CheckedKrum(num_malicious_nodes=config.num_malicious, **checked)
-    if config.strategy == "scaffold":
-        return CheckedScaffold(weights=weights, **checked)
-    return {"fedavg": CheckedFedAvg, "fedmedian": CheckedFedMedian}[config.strategy](**checked)
+    strategy, own = {
+        "fedavg": (CheckedFedAvg, {}),
+        "fedprox": (CheckedFedProx, {"proximal_mu": config.proximal_mu}),
+        "fedavgm": (CheckedFedAvgM, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
+        "fedadam": (CheckedFedAdam, {"eta": rate, "tau": ADAPTIVITY}),
+        "fedyogi": (CheckedFedYogi, {"eta": rate, "tau": ADAPTIVITY}),
+        "fedmedian": (CheckedFedMedian, {}),
+        "krum": (CheckedKrum, {"num_malicious_nodes": config.num_malicious}),
+        "scaffold": (CheckedScaffold, {"weights": weights}),
+    }[config.strategy]
+    return strategy(config=config, **own, **checked)

@@ -16,6 +16,7 @@ import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from flwr.serverapp import Grid
 
+from fedvla_lib.config import Config
 from fedvla_lib.federation.drift import geometry
 from fedvla_lib.federation.messages import (
     ARRAYS,
@@ -56,15 +57,11 @@ class Checked:
     """Mixin: write ``class CheckedX(Checked, X)`` for a Flower strategy X derived from FedAvg.
 
     Args:
+        config: settings of the run: who is sampled, encoding of arrays, clipping, replies that a round needs.
         roster: the clients that take part.
         shapes: names and shapes every reply must have.
         report: receives ``rejected``, ``train``, ``evaluate``, ``drift`` and ``replies`` events.
         keep_rollouts: receives (round, client's name, rollouts) of each good evaluation reply.
-        train_share, evaluate_share: share of the clients drawn in a round.
-        min_replies: good training replies without which the run stops.
-        seed: fixes who is drawn.
-        exchange: how arrays are encoded on the way; see `quantise`.
-        clip_norm: longest movement of a client that counts whole; a longer one is shortened to it. 0: none is.
         rounds_done: rounds of this run that an earlier process completed; Flower counts from 1 again.
         **flower: passed on to the Flower strategy.
     """
@@ -75,24 +72,17 @@ class Checked:
     def __init__(
         self,
         *,
+        config: Config,
         roster: Roster,
         shapes: Shapes,
         report: Report,
         keep_rollouts: Callable[[int, str, Rollouts], None],
-        train_share: float = 1.0,
-        evaluate_share: float = 1.0,
-        min_replies: int = 1,
-        seed: int = 0,
-        exchange: str = "float32",
-        clip_norm: float = 0.0,
         rounds_done: int = 0,
         **flower: Any,
     ) -> None:
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
-        self.roster, self.shapes, self.report, self.keep_rollouts = roster, shapes, report, keep_rollouts
-        self.train_share, self.evaluate_share = train_share, evaluate_share
-        self.min_replies, self.seed, self.exchange = min_replies, seed, exchange
-        self.clip_norm, self.rounds_done = clip_norm, rounds_done
+        self.config, self.roster, self.shapes = config, roster, shapes
+        self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
         self._asked: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
@@ -102,7 +92,7 @@ class Checked:
     ) -> Iterable[Message]:
         """Draw clients and address the global arrays, with their SHA-256, to each."""
         server_round += self.rounds_done
-        selection = self._select(self.train_share, server_round, 0)
+        selection = self._select(self.config.fraction_train, server_round, 0)
         self._global = unpack_arrays(arrays)
         config[DIGEST] = digest(self._downward(arrays))
         return self._counted(super().configure_train(server_round, arrays, config, selection))
@@ -112,7 +102,7 @@ class Checked:
     ) -> Iterable[Message]:
         """The same for evaluation; other clients may be drawn."""
         server_round += self.rounds_done
-        selection = self._select(self.evaluate_share, server_round, 1)
+        selection = self._select(self.config.fraction_evaluate, server_round, 1)
         if not selection.node_ids:
             return []
         config[DIGEST] = digest(self._downward(arrays))
@@ -128,15 +118,15 @@ class Checked:
         """
         server_round += self.rounds_done
         good = self._good(server_round, "train", replies, self._check_train)
-        if len(good) < self.min_replies:
+        if len(good) < self.config.min_replies:
             raise TooFewReplies(
                 f"round {server_round}: {len(good)} of {len(self._asked)} training replies are good, "
-                f"min-replies={self.min_replies} are required; the rejected ones are in metrics.jsonl"
+                f"min-replies={self.config.min_replies} are required; the rejected ones are in metrics.jsonl"
             )
-        for reply in good if self.exchange != "float32" else []:
+        for reply in good if self.config.exchange != "float32" else []:
             self._restore(reply)
         self._take(server_round, good)
-        for reply in good if self.clip_norm else []:
+        for reply in good if self.config.clip_norm else []:
             self._clip(reply)
         arrays, metrics = super().aggregate_train(server_round, good)
         return _as_float32(arrays), metrics
@@ -167,17 +157,17 @@ class Checked:
             setattr(self, attribute, [arrays[str(i)] for i in range(len(arrays))] if listed else arrays)
 
     def _downward(self, arrays: ArrayRecord) -> Arrays:
-        return encode(unpack_arrays(arrays), DOWNWARD[self.exchange])
+        return encode(unpack_arrays(arrays), DOWNWARD[self.config.exchange])
 
     def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
         """Flower's, with arrays of as many bits as asked for; strategies have noted the unrounded ones by now."""
-        if self.exchange != "float32":
+        if self.config.exchange != "float32":
             record[ARRAYS] = pack_arrays(self._downward(record[ARRAYS]))
         return super()._construct_messages(record, node_ids, message_type)
 
     def _restore(self, reply: Message) -> None:
         """Put into a reply that carries a change the arrays that it makes of the global ones."""
-        change = decode(unpack_arrays(reply.content[ARRAYS]), self.exchange)
+        change = decode(unpack_arrays(reply.content[ARRAYS]), self.config.exchange)
         reply.content[ARRAYS] = pack_arrays({name: self._global[name] + change[name] for name in change})
 
     def _clip(self, reply: Message) -> None:
@@ -185,8 +175,8 @@ class Checked:
         arrays = unpack_arrays(reply.content[ARRAYS])
         moved = {name: array - self._global[name] for name, array in arrays.items()}
         length = math.sqrt(sum(float(np.square(array, dtype=np.float64).sum()) for array in moved.values()))
-        if length > self.clip_norm:
-            share = np.float32(self.clip_norm / length)
+        if length > self.config.clip_norm:
+            share = np.float32(self.config.clip_norm / length)
             shortened = {name: self._global[name] + share * array for name, array in moved.items()}
             reply.content[ARRAYS] = pack_arrays(shortened)
 
@@ -203,7 +193,7 @@ class Checked:
         return messages
 
     def _select(self, share: float, server_round: int, purpose: int) -> SampledNodes:
-        rng = np.random.default_rng([self.seed, server_round, purpose])
+        rng = np.random.default_rng([self.config.seed, server_round, purpose])
         self._asked = self.roster.draw(share, rng)
         return SampledNodes(self._asked)
 
@@ -244,7 +234,7 @@ class Checked:
         announced = self.roster.examples_of.get(reply.metadata.src_node_id, _examples(reply))
         if _examples(reply) != announced:  # it would buy itself another weight in the average
             raise ParameterError("examples", f"{EXAMPLES}={_examples(reply)}, but it came with {announced}")
-        checked_arrays(reply.content, NOTE, self.shapes, also=self._also, exchange=self.exchange)
+        checked_arrays(reply.content, NOTE, self.shapes, also=self._also, exchange=self.config.exchange)
 
 
 def _check_evaluate(reply: Message) -> None:
