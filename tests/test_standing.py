@@ -1,4 +1,4 @@
-"""The SuperLink that stays up: started, found, used by Flower's own command, and stopped with all it started."""
+"""The SuperLink service: started, found, used by `flwr run`, and stopped with its child processes."""
 
 import json
 import os
@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.integration
 @pytest.mark.slow
 def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch, capsys):
-    """As a reader types them: up, and Ctrl-C; up again, `flwr run . local-simulation --stream ...`; last; down."""
+    """As a reader types them: up, interrupted; up again, `flwr run . local-simulation --stream ...`; last; down."""
     home = tmp_path / "flwr"
     monkeypatch.setenv("FLWR_HOME", str(home))
     before = (ROOT / "pyproject.toml").read_bytes()
@@ -43,8 +43,8 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         assert main(["superlink", "status"]) == 3 and not processes_of(home)
     try:
         assert main(["superlink", "up"]) == 0
-        assert main(["superlink", "up"]) == 0 and "is up already" in capsys.readouterr().out
-        assert main(["superlink", "last"]) == 2 and "has had no run yet" in capsys.readouterr().err
+        assert main(["superlink", "up"]) == 0 and "is already up" in capsys.readouterr().out
+        assert main(["superlink", "last"]) == 2 and "has had no runs yet" in capsys.readouterr().err
         run_app("local-simulation", tiny, "--federation-config", "num-supernodes=3 client-resources-num-cpus=1")
         (root,) = run_folder.run_folders(tiny)
         assert run_folder.read_stamp(root)["status"] == "completed"
@@ -64,9 +64,9 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
 
 
 def run_app(connection, config, *options):
-    """Call `flwr run` with settings as the README writes them: on the command line, those that differ.
+    """Call `flwr run` as in the README, with changed settings on the command line, and return its output.
 
-    Return what it says. It exits with 0 whatever became of the run.
+    It exits with 0 whether or not the run completed.
     """
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
@@ -79,13 +79,13 @@ def run_app(connection, config, *options):
 
 
 def interrupt_while_starting(home, sign):
-    """Start `fedvla superlink up` and end it before it answers, as Ctrl-C, `kill` or a closed terminal does."""
+    """Start `fedvla superlink up` and interrupt it before it is up, as Ctrl-C, `kill` or a closed terminal does."""
     command = [sys.executable, "-m", "fedvla_lib.cli", "superlink", "up"]
     options = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "preexec_fn": heed_interrupts}
     process = subprocess.Popen(command, **options)
     log = home / "superlink.log"
     log.unlink(missing_ok=True)
-    while not (log.exists() and log.stat().st_size):  # Flower has begun to say something
+    while not (log.exists() and log.stat().st_size):  # Flower has started
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
     os.killpg(process.pid, sign)
@@ -94,7 +94,7 @@ def interrupt_while_starting(home, sign):
 
 
 def processes_of(home):
-    """Flower's processes that keep their files there."""
+    """Return the processes with this FLWR_HOME that still run after 15 s."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -118,7 +118,10 @@ def test_connections_of_ones_own_stay_and_one_in_the_way_is_named(tmp_path):
     superlink_service.add_connections(file)
     assert file.read_text() == once
     other = own.replace("labs]", "local-simulation]")
-    for text, words in ((other, "has another \\[superlink.local-simulation\\]"), ("default = ", "is no TOML")):
+    for text, words in (
+        (other, "has a different \\[superlink.local-simulation\\]"),
+        ("default = ", "is not valid TOML"),
+    ):
         file.write_text(text)
         with pytest.raises(ValueError, match=words):
             superlink_service.add_connections(file)
@@ -155,8 +158,8 @@ def test_what_a_reader_types_names_connections_and_settings_that_there_are():
 def test_a_port_that_another_program_uses_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FLWR_HOME", str(tmp_path / "flwr"))
     with socket.socket() as other:
-        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a SuperLink may have left it a moment ago
-        if processes.is_free(9493):  # and no other program uses it indeed
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a SuperLink may just have closed it
+        if processes.is_free(9493):  # no other program uses it
             other.bind(("127.0.0.1", 9493))
             other.listen()
         assert main(["superlink", "up"]) == 2

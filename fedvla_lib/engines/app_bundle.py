@@ -1,4 +1,4 @@
-"""The app as Flower's programs take it: a folder with a project file, and the settings of a run."""
+"""The Flower app as a folder with a project file, and the settings of a run as a TOML file."""
 
 import json
 import shutil
@@ -9,13 +9,13 @@ from typing import Any
 
 from fedvla_lib.config import Config, to_run_config
 
-PROJECT = "fedvla-lib"  # as pyproject.toml and the installed package name it
+PROJECT = "fedvla-lib"  # name in pyproject.toml and of the installed package
 
 
 def stage_app(folder: Path) -> Path:
-    """Copy what the Flower app needs into ``folder/app`` and return it: `flwr` would search the whole checkout.
+    """Copy the Flower app into ``folder/app`` and return that, since `flwr` would search the whole checkout.
 
-    A library that was installed from its wheel has no project file beside it; the app then gets one of its own.
+    A library installed from a wheel has no project file; the app then gets a minimal one.
     """
     package = Path(__file__).resolve().parents[1]
     app = folder / "app"
@@ -29,16 +29,16 @@ def stage_app(folder: Path) -> Path:
 
 
 def _is_checkout(folder: Path) -> bool:
-    """Whether this is the project's own folder: a stranger's pyproject.toml may lie in site-packages."""
+    """Return whether `folder` is this project's checkout; site-packages may hold the pyproject.toml of another one."""
     project = folder / "pyproject.toml"
     return project.is_file() and tomllib.loads(project.read_text()).get("project", {}).get("name") == PROJECT
 
 
 def _project_file(package: str) -> str:
-    """Return the least that `flwr` takes as a project: a name, the two apps, the settings and what to bundle."""
+    """Return a minimal pyproject.toml for `flwr`: name, the two apps, the settings and the files to bundle."""
     try:
         release = version(PROJECT)
-    except PackageNotFoundError:  # a copied folder
+    except PackageNotFoundError:  # the library was copied, not installed
         release = "0"
     tables = {
         "project": {"name": PROJECT, "version": release, "description": "", "license": "Apache-2.0"},
@@ -52,12 +52,12 @@ def _project_file(package: str) -> str:
 
 
 def write_settings(folder: Path, config: Config) -> Path:
-    """Write ``folder/settings.toml`` for ``--run-config`` and return it."""
+    """Write ``folder/settings.toml``, a file for ``--run-config``, and return its path."""
     path = folder / "settings.toml"
     path.write_text(_toml(to_run_config(config)))
     return path
 
 
 def _toml(values: dict[str, Any]) -> str:
-    """Return the lines of a table: JSON's scalars and lists of them are TOML's."""
+    """Return the lines of a TOML table; JSON scalars and lists of scalars are valid TOML."""
     return "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())

@@ -1,9 +1,12 @@
-"""Certificates and keys for a deployment: who is the server, and which nodes may join.
+"""TLS certificates and node keys of a deployment.
 
-TLS: a certificate authority of one's own signs the server's certificate; nodes and users are given the authority's
-certificate and so know the server. Node authentication: each node has a key, the server knows its public half. For a
-deployment that lasts, take certificates from your own authority; these are valid for a few days.
+TLS: a new certificate authority (CA) signs the server's certificate; nodes and users get the CA's certificate and check
+the server against it. Node authentication: each node has a private key, the server has the public keys. The
+certificates are valid for a week; for a permanent deployment use those of your own CA.
 """
+
+# The package `trustme` would be shorter but is meant for tests only: its CA stays valid until the year 3000, and the
+# certificates it issues are also valid for clients and code signing.
 
 import ipaddress
 import os
@@ -20,13 +23,17 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 PEM, PKCS8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
 NO_PASSWORD = serialization.NoEncryption()
 DAYS = 7
-OWN_HOSTS = ("localhost", "127.0.0.1")  # under which a server reaches itself
-CLOCK_SKEW = timedelta(minutes=5)  # between machines that are to trust each other
+LOCAL_HOSTS = ("localhost", "127.0.0.1")
+CLOCK_SKEW = timedelta(minutes=5)  # tolerated between machines
+CA_USAGE = x509.KeyUsage(
+    digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
+    data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ServerFiles:
-    """Where the server's certificate, its key and the authority's certificate lie. Nodes get only `authority`."""
+    """Paths of the CA's certificate, the server's certificate and its private key. Nodes get only `authority`."""
 
     authority: Path
     certificate: Path
@@ -35,29 +42,29 @@ class ServerFiles:
 
 @dataclass(frozen=True)
 class NodeKey:
-    """A node's private key, which never leaves it, and the public one, which the server is told."""
+    """Paths of a node's private key, which never leaves the node, and of its public key, which the server registers."""
 
     private: Path
     public: Path
 
 
 def make_server(folder: Path, hosts: Sequence[str] = (), *, until: datetime | None = None) -> ServerFiles:
-    """Make an authority and a server certificate signed by it; the authority's own key is not kept.
+    """Make a CA and a server certificate signed by it; the CA's private key is not kept.
 
     Args:
-        folder: where the files go.
-        hosts: names and addresses under which nodes on other machines reach the server. Its own are added: a SuperLink
-            that listens on all addresses starts a helper there, which calls it on this one and checks who answers.
-        until: end of validity, with a time zone; default a week from now. One in the past makes an expired certificate.
+        folder: where the files are written.
+        hosts: names and addresses at which other machines reach the server. The local ones are added, because a
+            SuperLink also connects to itself.
+        until: end of validity, with a time zone; default a week from now. A past date makes an expired certificate.
     """
     until = until or datetime.now(UTC) + timedelta(days=DAYS)
     authority_key, server_key = ec.generate_private_key(ec.SECP384R1()), ec.generate_private_key(ec.SECP384R1())
     authority_name = _name("federation authority")
-    names = [_host(host) for host in dict.fromkeys([*hosts, *OWN_HOSTS])]
+    names = [_host(host) for host in dict.fromkeys([*hosts, *LOCAL_HOSTS])]
     authority = (
         _certificate(authority_name, authority_name, authority_key, until)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(sign_certificates=True), critical=True)
+        .add_extension(CA_USAGE, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(authority_key.public_key()), critical=False)
         .sign(authority_key, hashes.SHA256())
     )
@@ -78,7 +85,7 @@ def make_server(folder: Path, hosts: Sequence[str] = (), *, until: datetime | No
 
 
 def make_node_key(folder: Path, name: str) -> NodeKey:
-    """Make a key pair on the curve P-384, in the OpenSSH format that Flower reads, as `name` and ``name.pub``."""
+    """Make a P-384 key pair in OpenSSH format, which Flower reads, as files `name` and ``name.pub``."""
     folder.mkdir(parents=True, exist_ok=True)
     key, files = ec.generate_private_key(ec.SECP384R1()), NodeKey(folder / name, folder / f"{name}.pub")
     _write_secret(files.private, key.private_bytes(PEM, serialization.PrivateFormat.OpenSSH, NO_PASSWORD))
@@ -101,13 +108,6 @@ def _certificate(
     )
 
 
-def _usage(sign_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=True, key_cert_sign=sign_certificates, crl_sign=sign_certificates, content_commitment=False,
-        key_encipherment=False, data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
-    )  # fmt: skip
-
-
 def _name(common: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
@@ -120,6 +120,6 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _write_secret(path: Path, content: bytes) -> None:
-    """Write a file that only its owner may read."""
+    """Write a file that only its owner can read."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         file.write(content)

@@ -1,4 +1,4 @@
-"""Start, wait for and stop programs of this machine, and read from their logs why they failed."""
+"""Start, wait for and stop local programs, and extract the reason of a failure from their logs."""
 
 import os
 import re
@@ -10,26 +10,26 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-STARTUP_S = 120.0  # a cold two-core machine needs about 10 to 40 s
+STARTUP_S = 120.0  # a two-core machine needs 10 to 40 s just after a boot
 FIRST_ERROR = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
 
 
 class FlowerRunError(RuntimeError):
-    """The SuperLink did not start, or the run did not complete; the message holds Flower's own words."""
+    """The SuperLink did not start, or the run did not complete; the message quotes Flower's log."""
 
 
 def start(command: list[str], environment: dict[str, str], log: Path) -> subprocess.Popen:
-    """Start one of Flower's programs in a session of its own, which `stop` ends whole."""
+    """Start a program in a new session, so that `stop` also ends its child processes."""
     command = [program(command[0]), *command[1:]]
     with open(log, "ab") as output:
         return subprocess.Popen(command, env=environment, stdout=output, stderr=output, start_new_session=True)
 
 
 def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, what: str) -> None:
-    """Wait for a program to be ready.
+    """Wait until a program is ready.
 
     Raises:
-        FlowerRunError: it ended, or was not ready within two minutes; with the reason from its log.
+        FlowerRunError: the program ended or was not ready within two minutes; with the reason from its log.
     """
     deadline = time.monotonic() + STARTUP_S
     while not is_up():
@@ -40,11 +40,11 @@ def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, 
         time.sleep(0.5)
 
 
-def stop(process: subprocess.Popen, signs: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
-    """End a program and the processes it started, which share its session: politely, then by force."""
-    for sign in signs:
+def stop(process: subprocess.Popen, signals: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
+    """Send each signal in turn to a program and its child processes until the program has ended."""
+    for number in signals:
         try:
-            os.killpg(process.pid, sign)
+            os.killpg(process.pid, number)
             process.wait(timeout=15)
         except ProcessLookupError:
             return
@@ -53,29 +53,29 @@ def stop(process: subprocess.Popen, signs: Sequence[signal.Signals] = (signal.SI
 
 
 def program(name: str) -> str:
-    """Return a command of this interpreter's environment, whether or not that is on PATH."""
-    beside = Path(sys.executable).parent / name
-    return str(beside) if beside.exists() else name
+    """Return the path of a command installed next to this interpreter, which need not be on PATH; else its name."""
+    path = Path(sys.executable).parent / name
+    return str(path) if path.exists() else name
 
 
 def is_free(port: int) -> bool:
-    """Whether nothing on this machine listens on a port."""
+    """Return whether no program on this machine listens on a port."""
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) != 0
 
 
 def free_port() -> int:
-    """Return a port that nothing listens on."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 def reason(log: Path) -> str:
-    """Return the first exception of a log, which is the cause of those after it, and how the log ends."""
+    """Return the first exception in a log, which caused any later ones, and the end of the log."""
     text = log.read_text(errors="replace")
-    found = FIRST_ERROR.search(text)
-    cause = f"it began with {_one_line(found[1])}; " if found else ""
+    first = FIRST_ERROR.search(text)
+    cause = f"it began with {_one_line(first[1])}; " if first else ""
     return f"{cause}its log ends: {_one_line(text)}"
 
 

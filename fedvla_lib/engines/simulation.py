@@ -1,4 +1,4 @@
-"""The app on Flower's simulation runtime: Ray workers of this machine."""
+"""Run the app on Flower's simulation runtime, with Ray workers on this machine."""
 
 import tempfile
 from dataclasses import replace
@@ -9,10 +9,10 @@ from fedvla_lib.engines.app_bundle import stage_app, write_settings
 from fedvla_lib.engines.superlink import SuperLink, local_superlink, require_completed
 from fedvla_lib.run_folder import own_run, run_folders
 
-# Ray 2.55 gives its server and its raylet 30 s each to come up, and each of the raylet's helpers 15 s. All of that is
-# fixed in its code; a busy machine misses it, seldom twice.
+# Ray 2.55 has hard-coded start-up timeouts (30 s for its server and raylet, 15 s for the raylet's helpers). A busy
+# machine may exceed them, but rarely twice in a row.
 RUNTIME_TRIES = 3
-NOT_STARTED = "Simulation Runtime crashed"  # what Flower says if Ray did not come up, before any client was asked
+NOT_STARTED = "Simulation Runtime crashed"  # logged by Flower if Ray did not start, before any client was called
 
 
 def run_simulation(
@@ -21,7 +21,7 @@ def run_simulation(
     """Run a federation on Flower's simulation runtime (Ray workers) and return its run folder.
 
     Raises:
-        FlowerRunError: the run failed, or did not finish in time.
+        FlowerRunError: the run failed or timed out.
         ValueError: unusable settings.
     """
     config = check(replace(absolute(config), num_threads=config.num_threads or cpus_per_client))
@@ -37,7 +37,7 @@ def run_simulation(
 
 
 def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) -> str:
-    """Run the app, again if Flower's runtime did not come up, and return the id of the last run."""
+    """Run the app, retrying if Flower's runtime did not start, and return the id of the last run."""
     for _ in range(RUNTIME_TRIES):
         run_id = link.submit(app, *options, timeout_s=timeout_s)
         if NOT_STARTED not in link.log.read_text(errors="replace"):

@@ -1,10 +1,7 @@
-"""Flower's own programs as this library starts them: a local SuperLink, `flwr run`, and the run's real status.
+"""Wrappers of Flower's programs: a local SuperLink, `flwr run`, and the final status of a run.
 
-`run_simulation` runs the app on Flower's simulation runtime; `deploy` adds SuperNodes to a SuperLink from here.
-
-These are the documented commands, wrapped because four of their habits trip a small machine: the SuperLink that
-`flwr run` starts by itself gives up after 15 s, a client asks for two cores, a failed run still exits with 0, and Ray,
-which runs the clients, gives up if its own processes take long to start.
+Used by `simulation`, `deployment` and `superlink_service`. Flower's defaults do not suit a small machine or a script:
+`flwr run` gives the SuperLink that it starts only 15 s, and exits with 0 even if the run failed.
 """
 
 import json
@@ -26,7 +23,7 @@ from fedvla_lib.engines.processes import FlowerRunError, _one_line, free_port, p
 
 STATUS_TRIES, POLL_S = 6, 5.0
 COMPLETED = "finished:completed"
-OFFLINE = {  # Flower and Ray ask the network nothing
+OFFLINE = {  # no telemetry or update checks
     "FLWR_TELEMETRY_ENABLED": "0",
     "FLWR_DISABLE_UPDATE_CHECK": "1",
     "FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION": "1",
@@ -37,22 +34,21 @@ CONNECTION = "book"
 
 @dataclass(frozen=True)
 class SuperLink:
-    """A SuperLink that is up, and the environment in which `flwr` finds it."""
+    """A running SuperLink and the environment in which `flwr` finds it."""
 
     environment: dict[str, str]
-    log: Path  # what the run printed
+    log: Path  # output of `flwr run`
     port: int = 0
-    files: ServerFiles | None = None  # of a SuperLink with TLS
-    connection: str = CONNECTION  # its name in Flower's file of them
+    files: ServerFiles | None = None  # certificates, with TLS
+    connection: str = CONNECTION  # its name in Flower's config.toml
 
     def submit(self, app: Path, *options: str, timeout_s: float, watch: Callable[[], None] = lambda: None) -> str:
-        """Start a run of the app, follow its log until the run ends, and return its id.
+        """Start a run of the app, follow its log until the run ends, and return its id; call `watch` every second.
 
-        Following costs nothing, while each further `flwr` command costs seconds of computing time. Meanwhile `watch` is
-        called every second.
+        The log is followed because polling with `flwr` would cost seconds of CPU time per call.
 
         Raises:
-            FlowerRunError: the run was not accepted, or did not end in time.
+            FlowerRunError: the run was not accepted or timed out.
         """
         command = [program("flwr"), "run", str(app), self.connection, *options, "--stream"]
         with open(self.log, "wb") as log:
@@ -69,20 +65,20 @@ class SuperLink:
         return accepted[1]
 
     def status(self, run_id: str) -> tuple[str, str]:
-        """Return a run's status, such as ``running`` or ``finished:completed``, and its details."""
+        """Return the status of a run, such as ``running`` or ``finished:completed``, and its details."""
         answer = self.ask("list", self.connection, "--run-id", run_id)
         if not answer.get("runs"):
-            raise FlowerRunError(f"flwr list knows no run {run_id}")
+            raise FlowerRunError(f"flwr list does not know run {run_id}")
         return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
 
     def ask(self, *command: str) -> dict[str, Any]:
-        """Return the JSON that a `flwr` command answers.
+        """Run a `flwr` command and return its JSON output.
 
         Raises:
             FlowerRunError: the command failed.
         """
-        whole = [program("flwr"), *command, "--format", "json"]
-        done = subprocess.run(whole, env=self.environment, capture_output=True, text=True)
+        arguments = [program("flwr"), *command, "--format", "json"]
+        done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
             raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(done.stderr or done.stdout)}")
         answer = json.loads(done.stdout[done.stdout.find("{\n") :])
@@ -96,11 +92,11 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
     """Start a SuperLink on a free port of this machine, with `home` as FLWR_HOME, and stop it at the end.
 
     Args:
-        options: for ``flower-superlink``, such as ``--simulation``.
+        options: of ``flower-superlink``, such as ``--simulation``.
         files: certificates; without them the connection is not encrypted.
 
     Raises:
-        FlowerRunError: it did not answer within two minutes.
+        FlowerRunError: the SuperLink did not answer within two minutes.
     """
     port = free_port()
     environment = flower_environment(home)
@@ -121,9 +117,9 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
 
 
 def flower_environment(home: Path) -> dict[str, str]:
-    """Return the environment of Flower's programs: their files in `home`, no network but what they are told.
+    """Return the environment of Flower's programs, with `home` as FLWR_HOME and without telemetry.
 
-    Notebooks ask every program for colours, which would stand inside the JSON that `ask` reads.
+    Colours are switched off: Jupyter forces them on, and they would corrupt the JSON that `ask` reads.
     """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
     plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "CLICOLOR_FORCE")}
@@ -131,10 +127,10 @@ def flower_environment(home: Path) -> dict[str, str]:
 
 
 def require_completed(link: SuperLink, run_id: str) -> None:
-    """Ask how a run ended: `flwr run` exits with 0 for failed runs too, and the status may lag behind the log's end.
+    """Check how a run ended, since `flwr run` exits with 0 also for failed runs.
 
     Raises:
-        FlowerRunError: it did not complete.
+        FlowerRunError: the run did not complete.
     """
     status, details = last_status(link, run_id)
     if status != COMPLETED:
@@ -142,7 +138,7 @@ def require_completed(link: SuperLink, run_id: str) -> None:
 
 
 def last_status(link: SuperLink, run_id: str) -> tuple[str, str]:
-    """Return status and details of a run whose log has ended, once they say so, or after half a minute."""
+    """Return the final status and details of a run whose log has ended; the status may lag by up to half a minute."""
     for _ in range(STATUS_TRIES):
         status, details = link.status(run_id)
         if status.startswith("finished"):
@@ -152,7 +148,7 @@ def last_status(link: SuperLink, run_id: str) -> tuple[str, str]:
 
 
 def answers(port: int, files: ServerFiles | None = None) -> bool:
-    """Whether a SuperLink on this machine says that it is well."""
+    """Return whether a SuperLink on this machine reports that it is healthy."""
     scheme, trust = ("https", ssl.create_default_context(cafile=files.authority)) if files else ("http", None)
     try:
         with urllib.request.urlopen(f"{scheme}://127.0.0.1:{port}/health", timeout=2, context=trust) as response:
