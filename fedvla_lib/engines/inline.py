@@ -1,10 +1,11 @@
-"""Ways to run the one Flower app: here in this process, or on Flower's own runtimes with the same settings.
+"""Run the Flower app in this process, for notebooks, tests and debugging.
 
-`run_inline` is for notebooks, tests and breakpoints: a `Grid` of Flower's that calls the ClientApp in this process, one
-client after the other in the order of their partitions. Scale comes from Flower's engines, which run the same apps.
+A Flower `Grid` calls the ClientApp directly, one client after the other in the order of their partitions. To scale up,
+run the same app with `simulation` or `deployment`.
 """
 
 import copy
+import functools
 import logging
 import time
 import traceback
@@ -12,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import functools
 from flwr.app import Context, Error, Message, RecordDict, UserConfig
 from flwr.clientapp import ClientApp
 from flwr.common.constant import SUPERLINK_NODE_ID, ErrorCode
@@ -40,17 +40,17 @@ def run_inline(
     progress: bool = True,
     raise_errors: bool = False,
 ) -> Path:
-    """Run a federation in this process and return its run folder; the same settings give the same bits.
+    """Run a federation in this process and return its run folder; results are bitwise reproducible.
 
     Args:
-        clients_app: the ClientApp to call; default this library's, with frames and policy opened once for all clients.
-        data: a data set for each client; without, each takes its part of ``config.data``.
-        progress: show a bar over the clients of each round.
-        raise_errors: let a client's exception surface (for debugging) instead of rejecting its reply.
+        clients_app: the ClientApp to call; default this library's, with frames and policy loaded once for all clients.
+        data: a data set for each client; empty: each client uses its partition of ``config.data``.
+        progress: show a progress bar over the clients of each round.
+        raise_errors: re-raise a client's exception (for debugging) instead of rejecting its reply.
 
     Raises:
-        TooFewReplies: a round had fewer good replies than `config.min_replies`; what was written so far stays.
-        ValueError: settings, data or output folder that cannot be used.
+        TooFewReplies: a round had fewer valid replies than `config.min_replies`; the run folder is kept.
+        ValueError: unusable settings, data or output folder.
     """
     loaders = cached(client.LOADERS)
     app = clients_app or client_app.build(loaders)
@@ -64,21 +64,21 @@ def run_inline(
 
 
 def cached(loaders: client.Loaders) -> client.Loaders:
-    """Return loaders that open the frames and build the policy once, and share them with every client of a run."""
-    # Statistics hold arrays, which cannot be looked up by value; their text can, and keeps every bit.
+    """Return loaders that open the frames and build the policy once and share them between the clients of a run."""
+    # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
     build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
     frames = functools.cache(loaders.open_frames)
     return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)))
 
 
 class InlineGrid(Grid):
-    """Flower's grid without a network: a message sent is handled at once, an exception becomes an error reply.
+    """A Flower grid without a network: messages are handled as they are sent, exceptions become error replies.
 
     Args:
         app: handles the messages of all clients.
-        num_clients: clients there are; client k is node ``FIRST_NODE_ID + k``, with partition-id k and its own context.
-        run_config: settings of the run, as Flower passes them.
-        data: a data set for each client; none: the settings' own.
+        num_clients: number of clients; client k is node ``FIRST_NODE_ID + k`` with partition-id k and its own context.
+        run_config: settings of the run in Flower's format.
+        data: a data set for each client; empty: all use `config.data`.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class InlineGrid(Grid):
             self._contexts[node] = Context(RUN_ID, node, node_config, RecordDict(), dict(run_config))
 
     def set_run(self, run: Run) -> None:
-        """Take over the description of the run."""
+        """Set the description of the run."""
         self._run = run
 
     @property
@@ -122,27 +122,27 @@ class InlineGrid(Grid):
         return list(self._contexts)
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Handle each message in the order of nodes, and return one id per message."""
+        """Handle the messages in the order of nodes and return their ids."""
         ordered = sorted(messages, key=lambda message: message.metadata.dst_node_id)
         kind = ordered[0].metadata.message_type if ordered else ""
         bar = tqdm(ordered, desc=f"clients: {kind}", disable=not (self._progress and ordered), leave=False)
         return [self._handle(message) for message in bar]
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Hand out the replies to the given messages, once."""
+        """Return the replies to the given messages, each only once."""
         return [self._replies.pop(key) for key in message_ids if key in self._replies]
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Push and pull, without the replies of clients that took longer than `timeout` seconds.
+        """Push and pull, dropping the replies of clients that took longer than `timeout` seconds.
 
-        Clients take turns here, so each has a clock of its own, as if all had started at once on machines of their own.
+        Each client is timed separately, as if all ran in parallel on their own machines.
         """
         sent = self.push_messages(messages)
         replies = zip(sent, self.pull_messages(sent), strict=True)
         return [reply for key, reply in replies if timeout is None or self._took_s[key] <= timeout]
 
     def client_states(self) -> dict[str, Arrays]:
-        """Return the arrays in the clients' contexts, by node and record."""
+        """Return the arrays in the clients' contexts by ``node:record``."""
         return {
             f"{node}:{name}": unpack_arrays(record)
             for node, context in self._contexts.items()
@@ -150,15 +150,15 @@ class InlineGrid(Grid):
         }
 
     def restore_clients(self, states: dict[str, Arrays]) -> None:
-        """Put arrays back into the clients' contexts."""
+        """Restore the arrays of `client_states` in the clients' contexts."""
         for key, arrays in states.items():
             node, name = key.split(":", 1)
             self._contexts[int(node)].state[name] = pack_arrays(arrays)
 
     def _handle(self, message: Message) -> str:
-        """Give the client a copy, as a network would: what it does to it must not reach the server's own records."""
+        """Pass the client a copy, as a network would, so that its changes do not reach the server's records."""
         key = str(len(self._took_s))
-        message.metadata.__dict__["_message_id"] = key  # a reply names it; Flower's grids set it this way too
+        message.metadata.__dict__["_message_id"] = key  # replies refer to it; Flower's grids set it in the same way
         node, began = message.metadata.dst_node_id, time.perf_counter()
         try:
             self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])
@@ -174,13 +174,13 @@ class InlineGrid(Grid):
 
 
 def claim_identity() -> None:
-    """Tell Flower's message class who this process is, as Flower's runtimes do before they start an app."""
+    """Set the identity of this process for Flower's message class, as Flower's runtimes do before they start an app."""
     TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SUPERLINK_NODE_ID, 0
 
 
 @contextmanager
 def _quiet_flower() -> Iterator[None]:
-    """Keep Flower's line per event out of notebooks: the run folder has it all."""
+    """Suppress Flower's info log; the run folder has the same events."""
     flower = logging.getLogger("flwr")
     before = flower.level
     flower.setLevel(logging.WARNING)
