@@ -1,7 +1,8 @@
 """Federated, centralized and every client alone, on the same attempts, over several seeds.
 
 A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are the same ones. The best client
-of a run is chosen by these very attempts, which favours it. Finished seeds are kept and not measured again.
+of a run is chosen by these very attempts, which favours it. A client alone takes its share of the steps, so
+these rates say what it gets for an equal total, not what it can do. Finished seeds are kept and not measured again.
 
     python benchmarks/four_arms.py
 """

@@ -243,11 +243,60 @@ def test_the_front_page_says_what_the_stored_comparison_found():
     stored = results.read_results(ROOT / build_book.COMPARISON)
     rows = stored[(stored.partition == "task") & (stored.arm == "fedavg-200x2x2")]
     said = build_book._headline(ROOT / build_book.COMPARISON)
-    assert f"the federated model {100 * rows.success.mean():.1f} % [" in said
-    assert f"{len(rows):,} attempts over {rows.run.nunique()} training seeds" in said
+    assert f"the federated model succeeds in {100 * rows.success.mean():.1f} % [" in said
+    assert f"{len(rows):,} rollouts over {rows.run.nunique()} training seeds" in said
+    in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
+    assert f"After {in_all} gradient steps in all" in said and f"has walked {in_a_row} steps in a row" in said
     assert set(stored.partition) <= set(build_book.DEALT)
     gaps = results.differences(results.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
         words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
-        assert words in said and said.count(" points [") == len(gaps)
+        assert words in said.split("Federated minus pooled: ")[1].split("\n")[0]
+    assert said.count(" points [") == len(gaps) + 1  # and federated minus labs alone, at their own tasks
     assert build_book.HEADLINE in (ROOT / build_book.FRONT_PAGE).read_bytes()
+
+
+@pytest.mark.unit
+def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_judged():
+    stored = results.read_results(ROOT / build_book.COMPARISON)
+    stored = stored[stored.partition == "task"]
+    said = build_book._headline(ROOT / build_book.COMPARISON)
+    share, longer = (stored[stored.arm == arm] for arm in ("local-only", "local-only-800"))
+    steps = {arm: part.steps_in_all.unique().item() for arm, part in (("share", share), ("longer", longer))}
+    assert f"only its share of the steps, {steps['share']}, succeeds in {100 * share.success.mean():.1f} % [" in said
+    assert "no measure of what a lab can do alone" in said and "is not answered by this grid" in said
+    own = longer[results.at_own_task(longer)]
+    federated = stored[(stored.arm == "fedavg-200x2x2") & stored.run.isin(own.run)]
+    same = federated.merge(own[["run", "task", "seed"]], on=["run", "task", "seed"])
+    assert len(same) == len(own) and own.counted.all()
+    assert f"After {steps['longer']} steps each, labs alone succeed in {100 * own.success.mean():.1f} % [" in said
+    assert f"of {len(own)} rollouts at their own task" in said
+    gap = 100 * (same.success.mean() - own.success.mean())
+    assert f"{100 * same.success.mean():.1f} % [" in said and f"federated minus alone, {gap:.1f} points [" in said
+    assert "one training seed" in said, "of several seeds the sentence says how many"
+    assert "`local-only`" in said.split("The steps of ")[1].split(" follow from")[0], "steps that nobody counted"
+
+
+@pytest.mark.unit
+def test_the_front_page_draws_each_arm_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
+    drawn = []
+    draw = build_book.plots.success_intervals
+    keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
+    monkeypatch.setattr(build_book.plots, "success_intervals", keep)
+    picture = build_book._outcome(ROOT / build_book.COMPARISON)
+    assert picture.startswith(b"\x89PNG") and picture == build_book._outcome(ROOT / build_book.COMPARISON)
+    rows = [label.get_text() for label in drawn[0].get_yticklabels()]
+    assert {"local-only, own task, 80 steps", "local-only, other tasks, 80 steps", "centralized, 800 steps",
+            "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(rows)  # fmt: skip
+    assert build_book.OUTCOME.removeprefix("book/") in build_book._headline(ROOT / build_book.COMPARISON)
+
+
+@pytest.mark.unit
+def test_the_front_page_is_not_built_over_arms_that_took_other_steps(monkeypatch):
+    read = results.read_results
+    longer = lambda folder: (rows := read(folder)).assign(  # noqa: E731
+        steps_in_all=rows.steps_in_all.where(rows.arm != "centralized", rows.steps_in_all + 1)
+    )
+    monkeypatch.setattr(build_book.results, "read_results", longer)
+    with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in steps"):
+        build_book._headline(ROOT / build_book.COMPARISON)

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 from conftest import heed_interrupts
+from fedvla_lib import run_folder
 from fedvla_lib.cli import commands
 from fedvla_lib.cli.commands import settings
 from fedvla_lib.cli.main import main
@@ -137,6 +138,8 @@ def test_resumed_training_ends_like_an_uninterrupted_one(tmp_path, capsys):
     root = next(halves.iterdir())
     _undo_last_step(root)
     assert main(["train", "--resume", str(root), "--client", "1", "--steps", "2"]) == 0
+    counted = run_folder.read_metrics(root, "evaluate").gradient_steps
+    assert counted.iloc[-1] == 2 and "2 steps in" in capsys.readouterr().out
     weights = [next(path.glob("*/model/model.safetensors")) for path in (whole, halves)]
     assert weights[0].read_bytes() == weights[1].read_bytes()
     assert json.loads((root / "stamp.json").read_text())["status"] == "completed"

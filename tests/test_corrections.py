@@ -53,7 +53,7 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
         correction = correction_for(message, context, {"w": weight})
         local_phase(weight, k, correction)
         arrays = {"w": weight.detach().numpy()}
-        metrics = MetricRecord({messages.EXAMPLES: examples[k], "loss": 0.0, "seconds": 0.0})
+        metrics = MetricRecord({messages.EXAMPLES: examples[k], messages.STEPS: 1, "loss": 0.0, "seconds": 0.0})
         note = messages.make_note(sha256=digest(arrays))
         reply = RecordDict(
             {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: metrics, messages.NOTE: note}

@@ -2,22 +2,25 @@
 
 import json
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import faulty
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, task_names
 from fedvla_lib.data import recordings, splits
 from fedvla_lib.data.batches import Batches, frame_rows
 from fedvla_lib.data.record import MAX_ATTEMPTS, demonstration_seed
-from fedvla_lib.evaluation import measure
+from fedvla_lib.engines import inline
+from fedvla_lib.evaluation import compare_runs, measure
 from fedvla_lib.evaluation.rollouts import FIRST_SEED
 from fedvla_lib.experiments import experiment, methods, results
-from fedvla_lib.experiments.plan import QUIET, Plan, read_plan
+from fedvla_lib.experiments.plan import QUIET, Cell, Plan, read_plan
 from fedvla_lib.federation.client import CLIENT_SEEDS
 
 REFERENCE = Path(__file__).parents[1] / "book" / "reference"
@@ -130,10 +133,20 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     pairs = rows.groupby("arm")[["task", "seed"]].apply(lambda part: sorted(map(tuple, part.values)))
     assert all(pair == pairs.iloc[0] for pair in pairs)  # every arm made the same attempts
     steps = rows.groupby("arm").gradient_steps.first()
-    assert steps["start"] == 0 and steps["averaged"] == steps["pooled"] == steps["alone"]
+    assert steps["start"] == 0 and steps["averaged"] == steps["pooled"] == steps["alone"] == 4
+    models = {arm: run_folder.read_stamp(out / f"mixed_{arm}_0")["steps"] for arm in steps.index}
+    assert models == {
+        "start": {"global": {"in_all": 0, "in_a_row": 0}}, "averaged": {"global": {"in_all": 4, "in_a_row": 2}},
+        "pooled": {"global": {"in_all": 4, "in_a_row": 4}},
+        "alone": {f"client_{k}": {"in_all": 2, "in_a_row": 2} for k in (0, 1)},
+    }  # fmt: skip
+    assert rows.counted.all() and (each.steps_in_all == 4).all()
+    of_model = rows.groupby("arm")[["steps_in_all", "steps_in_a_row"]].agg(["min", "max"])
+    assert of_model.loc["alone"].tolist() == [2, 2, 2, 2] and of_model.loc["averaged"].tolist() == [4, 4, 2, 2]
     travelled = rows.groupby("arm").bytes.first()
     assert travelled["averaged"] > 1e6 and travelled["pooled"] == travelled["start"] == 0
     assert rows.groupby("arm").loss.first().nunique() == 4
+    said = said.replace("True", "1")
     spent = printed_table(said, "gradient_steps")  # what is equal, and what is not, stands in the table at the end
     learned = ["averaged", "pooled", "alone"]
     assert spent.loc[learned, "gradient_steps"].tolist() == [steps["averaged"]] * 3
@@ -148,6 +161,22 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
         results.read_results(tmp_path / "nowhere")
+
+
+@pytest.mark.integration
+def test_a_cell_whose_clients_failed_is_stamped_with_the_steps_that_were_taken(recording, tmp_path, monkeypatch):
+    """In round 1 client 0 fails, in round 2 client 1 is rejected: half of what the settings ask for is averaged."""
+    monkeypatch.setattr(methods.engine, "run_inline", partial(inline.run_inline, clients_app=faulty.app))
+    settings = {"tasks": "lift", "data": str(recording), "num_clients": 2, "num_server_rounds": 2, "local_steps": 3}
+    config = from_profile("tiny", **QUIET, **settings)
+    cell = Cell("averaged", "federated", "mixed", 0, config)
+    experiment.measure_cell(cell, [2_000_000], tmp_path)
+    stamp, asked = run_folder.read_stamp(tmp_path / cell.name), methods.total_steps(config)
+    assert stamp["steps"] == {"global": {"in_all": asked // 2, "in_a_row": 6}} and asked == 12
+    assert stamp["gradient_steps"] == asked // 2 and stamp["samples"] == asked // 2 * config.batch_size
+    assert compare_runs.read_run(tmp_path / cell.name).gradient_steps == asked // 2
+    rows = results.read_results(tmp_path)
+    assert rows.counted.all() and set(rows.steps_in_all) == {asked // 2}
 
 
 @pytest.mark.unit

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from safetensors.numpy import load_file
 
 from fedvla_lib import run_folder
@@ -95,6 +96,27 @@ def test_two_chapters_that_want_the_same_models_at_once_train_them_once(tiny):
         alone = list(chapters.map(methods.local_only, [config, config], [0, 0]))
     assert first == second and list(first.parent.glob("*/")) == [first]
     assert same(*(bundle.shared_arrays() for bundle in alone))
+
+
+def test_a_model_in_the_cache_keeps_the_steps_that_it_counted_beside_weights_that_still_load(tiny):
+    config = replace(tiny, seed=12, num_clients=2, num_server_rounds=2, local_steps=3, **NO_ROLLOUTS)
+    with pytest.raises(ValueError, match="centralized has not been trained with these settings"):
+        methods.counted(config)
+    trained = [methods.centralized(config, progress=False), methods.local_only(config, 1, progress=False)]
+    assert methods.counted(config) == {"in_all": 12, "in_a_row": 12}
+    assert methods.counted(config, 1) == {"in_all": 6, "in_a_row": 6}  # a share of the steps, not all of them
+    folders = [methods._place(config, name) for name in ("centralized", "local-only-1")]
+    for bundle, kept in zip(trained, folders, strict=True):
+        assert (kept / methods.STEPS_FILE).is_file()
+        assert same(SmolVLAPolicy.from_pretrained(kept).state_dict(), bundle.policy.state_dict())
+
+
+def test_a_model_that_stopped_early_is_not_said_to_have_taken_the_steps_of_the_settings(tiny, monkeypatch):
+    config = replace(tiny, seed=13, num_clients=2, num_server_rounds=2, local_steps=3, **NO_ROLLOUTS)
+    early = lambda *of, steps, **how: training.local_train(*of, steps=steps - 1, **how)  # noqa: E731
+    monkeypatch.setattr(methods, "local_train", early)
+    methods.centralized(config, progress=False)
+    assert methods.counted(config) == {"in_all": 11, "in_a_row": 11} and methods.total_steps(config) == 12
 
 
 def test_two_runs_with_one_seed_agree_bit_for_bit(tiny):
@@ -256,6 +278,7 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
     assert "no space left on device" in rejected.detail.iloc[-1]
     counts = run_folder.read_metrics(root, "replies").query("to == 'train'").iloc[0]
     assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 7, 1)
+    assert run_folder.counted_steps(root) == {"in_all": 1, "in_a_row": 1}  # what was averaged, not what was asked for
 
     store = tools.open_frames(config)
     alone = open_client(config, 7, tools)

@@ -1,12 +1,14 @@
 """Checkpoints of stored runs: how held-out loss ranks them beside success, and which pairs it ranks the wrong way."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from fedvla_lib.data import partition as partition_module
 from fedvla_lib.experiments import results
 
 pytestmark = pytest.mark.unit
@@ -103,6 +105,70 @@ def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
     there = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "uneven"))).assign(run=5)
     found = results.fill_in(here, there, "shared")
     assert found.groupby("partition").run.unique().map(list).to_dict() == {"task": [0, 1], "iid": [5], "uneven": [5]}
+
+
+COMPARISON = ROOT / "book" / "reference" / "comparison"
+
+
+def test_steps_of_cells_without_counts_follow_from_settings_for_each_model_and_are_said_to():
+    rows = results.read_results(COMPARISON)
+    rows = rows[~rows.counted & (rows.partition == "task") & (rows.run == 0)]
+    found = rows.groupby("arm")[["gradient_steps", "steps_in_all", "steps_in_a_row"]].agg(lambda of: of.unique().item())
+    assert found.loc["local-only"].tolist() == [800, 80, 80]  # ten clients: the sum is no client's
+    assert found.loc["fedavg-200x2x2"].tolist() == [800, 800, 400]
+    assert found.loc["fedavg-10x4x20"].tolist() == [800, 800, 200]
+    assert found.loc["centralized"].tolist() == [800, 800, 800] and found.loc["base"].tolist() == [0, 0, 0]
+
+
+def test_counts_of_a_stamp_are_read_for_the_model_that_made_each_attempt(tmp_path):
+    cell = Path(shutil.copytree(COMPARISON / "task_local-only_0", tmp_path / "task_local-only_0"))
+    counts = {f"client_{k}": {"in_all": 100 + k, "in_a_row": 90 + k} for k in range(10)}
+    stamp = json.loads((cell / "stamp.json").read_text())
+    (cell / "stamp.json").write_text(json.dumps({**stamp, "steps": counts}))
+    rows = results.read_results(tmp_path)
+    assert rows.counted.all()
+    assert (rows.steps_in_all == 100 + rows.client).all() and (rows.steps_in_a_row == 90 + rows.client).all()
+    line = results.summary(rows).iloc[0]
+    assert line.counted and line.steps_in_all == pytest.approx(rows.steps_in_all.mean())
+
+
+def test_a_clients_own_task_is_the_one_that_partitions_deal_to_it():
+    rows = results.read_results(COMPARISON)
+    alone = rows[(rows.partition == "task") & (rows.arm == "local-only") & (rows.run == 0)]
+    episodes = [{"episode_id": number, "task": task} for number, task in enumerate(["push", "lift", "place"] * 40)]
+    parts = partition_module.partition(pd.DataFrame(episodes), 10, "task")
+    held = [{episodes[number]["task"] for number in part} for part in parts]
+    assert [len(tasks) for tasks in held] == [1] * 10
+    expected = [task in held[int(client)] for task, client in zip(alone.task, alone.client, strict=True)]
+    assert results.at_own_task(alone).tolist() == expected and sum(expected) == len(alone) / 3
+    assert not results.at_own_task(rows[rows.arm == "centralized"]).any()
+    assert not results.at_own_task(rows[rows.arm == "centralized"].drop(columns="client")).any()
+
+
+def test_arms_are_named_by_their_steps_and_those_alone_split_by_whose_task_it_was():
+    rows = results.read_results(COMPARISON)
+    rows = rows[(rows.partition == "task") & (rows.run == 0)]
+    named = results.by_steps(rows)
+    assert len(named) == len(rows) and named.success.sum() == rows.success.sum()
+    names = list(dict.fromkeys(named.arm))
+    assert names[:3] == ["base, 0 steps", "local-only, own task, 80 steps", "local-only, other tasks, 80 steps"]
+    assert {"centralized, 800 steps", "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(names)
+    own = rows[(rows.arm == "local-only") & results.at_own_task(rows)]
+    assert named[named.arm == names[1]].success.mean() == own.success.mean()
+
+
+@pytest.mark.parametrize("seeds", [1, 5])
+def test_labs_alone_are_held_against_the_federation_on_the_very_attempts_at_their_own_tasks(seeds):
+    rows = results.read_results(COMPARISON)
+    rows = rows[(rows.partition == "task") & (rows.run < seeds)]
+    found = results.beside_own_tasks(rows, "local-only", "fedavg-200x2x2", seed=0)
+    own = rows[(rows.arm == "local-only") & results.at_own_task(rows)]
+    same = rows[rows.arm == "fedavg-200x2x2"].merge(own[["run", "task", "seed"]])
+    assert found["seeds"] == seeds and found["n"] == len(own) == len(same) == 100 * seeds
+    assert found["success_rate"] == own.success.mean() and found["other_rate"] == same.success.mean()
+    assert found["difference"] == pytest.approx(own.success.mean() - same.success.mean())
+    assert found["low"] < found["difference"] < found["high"]
+    assert found["other_low"] < found["other_rate"] < found["other_high"]
 
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):

@@ -68,6 +68,17 @@ def test_events_become_columns(tmp_path):
         json.loads(line, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
 
 
+def test_a_federations_steps_are_counted_by_its_clients_round_by_round(tmp_path):
+    with run_folder.start(from_profile("tiny", out=str(tmp_path), num_server_rounds=9), engine="inline") as run:
+        for number, who, steps in ((1, "client_0", 4), (1, "client_1", 3), (2, "client_1", 5)):
+            run.log(number, who, "train", {"loss": 1.0, "steps": steps})
+        run.log(2, "client_0", "rejected", {"to": "train", "reason": "hash"})
+        run.log(2, "global", "rollout", {"success": True, "steps": 77})  # control steps of the robot
+    assert run_folder.counted_steps(run.root) == {"in_all": 4 + 3 + 5, "in_a_row": 4 + 5}
+    run.log(3, "client_0", "train", {"loss": 1.0})  # of a version that did not count
+    assert run_folder.counted_steps(run.root) is None
+
+
 def test_a_line_cut_off_by_a_crash_is_left_out_and_a_broken_one_is_named(tmp_path):
     with run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
         run.log(1, "global", "evaluate", {"loss": 1.0})

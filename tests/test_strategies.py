@@ -19,6 +19,7 @@ from fedvla_lib.federation.messages import (
     EXAMPLES,
     METRICS,
     NOTE,
+    STEPS,
     checked_arrays,
     make_note,
     pack_arrays,
@@ -44,10 +45,10 @@ def random_arrays(seed, scale=1.0):
     return {name: np.asarray(scale * rng.normal(size=shape), np.float32) for name, shape in SHAPES.items()}
 
 
-def reply_content(arrays, examples=10, loss=1.0):
+def reply_content(arrays, examples=10, loss=1.0, steps=2):
     return {
         ARRAYS: pack_arrays(arrays),
-        METRICS: MetricRecord({EXAMPLES: examples, "loss": loss, "seconds": 0.1}),
+        METRICS: MetricRecord({EXAMPLES: examples, STEPS: steps, "loss": loss, "seconds": 0.1}),
         NOTE: make_note(sha256=digest(arrays)),
     }
 
@@ -237,6 +238,9 @@ FAULTS = {
     "no metrics": ("metrics", lambda: _without(reply_content(GOOD), METRICS)),
     "zero examples": ("examples", lambda: reply_content(GOOD, examples=0)),
     "negative examples": ("examples", lambda: reply_content(GOOD, examples=-5)),
+    "no step": ("metrics", lambda: reply_content(GOOD, steps=0)),
+    "half a step": ("metrics", lambda: reply_content(GOOD, steps=2.5)),
+    "steps that were not counted": ("metrics", lambda: reply_content(GOOD, steps=float("nan"))),
     "infinite loss": ("metrics", lambda: reply_content(GOOD, loss=float("inf"))),
     "extra metric": (
         "metrics",

@@ -67,8 +67,15 @@ def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
         training.local_train(broken, Dies(), CONFIG, steps=6, checkpoints=Checkpoints(tmp_path / "cut"), progress=False)
     assert [p.name for p in sorted((tmp_path / "cut").iterdir())] == ["step_000002", "step_000004"]
     resumed, resumed_result = run(6, checkpoints=Checkpoints(tmp_path / "cut", resume=True))
-    assert resumed_result.losses == whole_result.losses
+    assert resumed_result.losses == whole_result.losses and resumed_result.steps == whole_result.steps == 6
     assert same(weights(whole), weights(resumed))
+
+
+@pytest.mark.unit
+def test_steps_are_those_that_were_done_not_those_that_were_asked_for(tmp_path):
+    run(6, checkpoint_dir=tmp_path)
+    _, again = run(4, checkpoint_dir=tmp_path, resume=True)  # the newest checkpoint lies behind what is asked for
+    assert again.steps == len(again.losses) == 6
 
 
 @pytest.mark.unit

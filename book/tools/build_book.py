@@ -16,6 +16,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -34,6 +35,8 @@ from papermill.exceptions import PapermillExecutionError
 
 import library
 import status
+from fedvla_book import plots
+from fedvla_lib.evaluation import statistics
 from fedvla_lib.experiments import results
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,8 +51,9 @@ FUNCTIONS_PAGE, FUNCTIONS = "book/library.md", b"<!-- functions -->"
 FILM = b"<!-- film -->"  # on the front page: the federated policy in this build
 FILMED_IN = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
-TOLD_BY = {"fedavg-200x2x2": "the federated model", "centralized": "training on all demonstrations in one place",
-           "local-only": "a lab on its own"}  # fmt: skip
+OUTCOME = "book/_static/outcome.png"  # the figure of it
+FEDERATED, POOLED, ALONE, LONGER = "fedavg-200x2x2", "centralized", "local-only", "local-only-800"  # arms it tells of
+NEARLY_SOLVED = 0.8  # success of labs alone above which their tasks leave little for a federation to add
 DEALT = {"iid": "the same mix of tasks in every lab", "dirichlet-0_5": "uneven mixes (Dirichlet, 0.5)",
          "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task a lab",
          "lab": "labs that differ in camera, light and calibration"}  # fmt: skip
@@ -67,7 +71,7 @@ RESULTS_ON = {
 TITLES = {
     "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
     "floor": "the floor",
-    "four_arms": "one federation after another, its clients alone, and centralized",
+    "four_arms": "one federation after another, its clients alone with their share of the steps, and centralized",
 }
 BENCHMARKS = "benchmarks/results"
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results, as chapters name it
@@ -286,6 +290,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     executed = {chapter.name: chapter.executed for chapter in chapters}
     _put(wanted, STATUS_PAGE, STATUS, lambda: status.status(root, executed.values(), profile))
     _put(wanted, FRONT_PAGE, FILM, lambda: _film(executed[FILMED_IN], profile))
+    if HEADLINE in wanted.get(Path(FRONT_PAGE), b""):
+        wanted[Path(OUTCOME)] = _outcome(root / COMPARISON)
     _put(wanted, FRONT_PAGE, HEADLINE, lambda: _headline(root / COMPARISON))
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
@@ -350,23 +356,109 @@ def _film(chapter: Path, profile: str) -> str:
 
 
 def _headline(comparison: Path) -> str:
-    """What the stored comparison says: the arms with one task a lab, and federated minus pooled in each partition."""
+    """What the stored comparison says, one sentence a line, and a figure of it, for the front page.
+
+    Raises:
+        BookError: federated and pooled training differ in their steps in all, so that the first sentence is wrong.
+    """
     rows = results.repeat_partition_free(results.read_results(comparison))
-    rows = rows[rows.arm.isin(TOLD_BY)]
-    of_arm = results.summary(rows[rows.partition == "task"]).set_index("arm")
-    rates = ", ".join(
-        f"{who} {_points(100 * of_arm.success_rate[arm], 100 * of_arm.low[arm], 100 * of_arm.high[arm], ' %')}"
-        for arm, who in TOLD_BY.items()
-    )
-    federated, pooled, _ = TOLD_BY
-    found = results.differences(rows, [(federated, pooled)], seed=0).set_index("partition")
-    gaps = "; ".join(_gap(words, found.loc[name]) for name, words in DEALT.items() if name in found.index)
-    seeds, attempts = of_arm.seeds[federated], of_arm.attempts[federated]
+    of_task = rows[rows.partition == "task"]
+    of_arm = results.summary(of_task).set_index("arm")
+    labs, tasks = of_task.client.nunique(), of_task.task.nunique()
+    return "\n".join([
+        f"**What comes out.** Each of {labs} labs holds demonstrations of one of {tasks} tasks.",
+        *_at_equal_total(of_arm), _gaps(rows), *_with_its_share(of_arm), *_with_steps_of_its_own(of_task),
+        _counting(of_arm), "", _outcome_figure(of_arm),
+    ])  # fmt: skip
+
+
+def _at_equal_total(of_arm: pd.DataFrame) -> list[str]:
+    federated, pooled = of_arm.loc[FEDERATED], of_arm.loc[POOLED]
+    if federated.steps_in_all != pooled.steps_in_all or federated.attempts != pooled.attempts:
+        raise BookError(f"{FEDERATED} and {POOLED} differ in steps in all or in rollouts: the front page says equal")
+    return [
+        f"After {federated.steps_in_all:,.0f} gradient steps in all, the federated model succeeds in "
+        f"{_rate_of(federated)} of rollouts, and training on all demonstrations in one place in {_rate_of(pooled)}, "
+        f"each in {federated.attempts:,} rollouts over {federated.seeds} training seeds.",
+        f"The labs of a round train side by side, so the federated model has walked {federated.steps_in_a_row:,.0f} "
+        f"steps in a row, the pooled one {pooled.steps_in_a_row:,.0f}.",
+    ]
+
+
+def _gaps(rows: pd.DataFrame) -> str:
+    found = results.differences(rows, [(FEDERATED, POOLED)], seed=0).set_index("partition")
+    gaps = [_gap(words, found.loc[name]) for name, words in DEALT.items() if name in found.index]
+    return f"Federated minus pooled: {'; '.join(gaps)}."
+
+
+def _with_its_share(of_arm: pd.DataFrame) -> list[str]:
+    alone = of_arm.loc[ALONE]
+    return [
+        f"A lab alone with only its share of the steps, {alone.steps_in_all:,.0f}, succeeds in {_rate_of(alone)} of "
+        f"{alone.attempts:,} rollouts over {alone.seeds} training seeds.",
+        "It was judged on all tasks, most of which it never saw: "
+        "this number is no measure of what a lab can do alone.",
+    ]
+
+
+def _with_steps_of_its_own(of_task: pd.DataFrame) -> list[str]:
+    """Labs alone after as many steps as the federation, at their own task, and the federated model beside them."""
+    longer = of_task[of_task.arm == LONGER]
+    steps, elsewhere = longer.steps_in_all.mean(), longer[~results.at_own_task(longer)]
+    found = results.beside_own_tasks(of_task, LONGER, FEDERATED, seed=0)
+    rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
+    gap = _points(*(-100 * found[end] for end in ("difference", "high", "low")), " points")
+    others = _percent(elsewhere.success.mean(), *statistics.success_interval(elsewhere))
+    once = "That is one training seed, so these intervals are for other rollouts, not for other trainings."
+    easy = found["success_rate"] > NEARLY_SOLVED
+    why = "few demonstrations nearly solve these tasks" if easy else "one lab holds few demonstrations of few tasks"
+    return [
+        f"After {steps:,.0f} steps each, labs alone succeed in {rates[0]} of {found['n']:,} rollouts at their own "
+        f"task, and the federated model in {rates[1]} of the same rollouts: federated minus alone, {gap}.",
+        f"At the other labs' tasks labs alone succeed in {others} of {len(elsewhere):,} rollouts; "
+        "the federated model is one model for all tasks.",
+        once if found["seeds"] == 1 else f"These are {found['seeds']} training seeds.",
+        f"Whether federating is worth it is not answered by this grid: {why}.",
+    ]
+
+
+def _counting(of_arm: pd.DataFrame) -> str:
+    told = "Brackets are 95 % intervals, and {doc}`/notebooks/06_federated_vs_centralized` says how they were made."
+    planned = [f"`{arm}`" for arm, counted in of_arm.counted.items() if not counted]
+    if not planned:
+        return told
+    return f"{told}\nThe steps of {', '.join(planned)} follow from their settings: those runs are older than counting."
+
+
+def _outcome_figure(of_arm: pd.DataFrame) -> str:
+    few = [f"`{arm}`" for arm, seeds in of_arm.seeds.items() if seeds == 1]
+    once = f" Of one training seed, with intervals for other rollouts only: {', '.join(few)}." if few else ""
     return (
-        f"**What comes out.** Ten labs with one task each of three, {attempts:,} attempts over {seeds} training seeds, "
-        f"equal gradient steps: {rates}. Federated minus pooled: {gaps}. Brackets are 95 % intervals, and "
-        "{doc}`/notebooks/06_federated_vs_centralized` says how they were made."
+        f"```{{figure}} {Path(OUTCOME).relative_to('book').as_posix()}\n"
+        ":alt: Points with intervals, one row an arm with the gradient steps of its model: success rates of the base, "
+        "of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
+        ":width: 100%\n\n"
+        "Success of each arm with one task a lab, and the gradient steps of one model of it. Of labs alone, rollouts "
+        f"at their own task and at other tasks stand apart.{once}\n```"
     )
+
+
+def _outcome(comparison: Path) -> bytes:
+    """The figure under the front page's sentences, as PNG."""
+    rows = results.repeat_partition_free(results.read_results(comparison))
+    plots.use_style()
+    axes = plots.success_intervals(results.summary(results.by_steps(rows[rows.partition == "task"])), ylabel="arm")
+    with tempfile.TemporaryDirectory() as folder:
+        plots.save(axes, Path(folder) / "outcome.png")
+        return (Path(folder) / "outcome.png").read_bytes()
+
+
+def _rate_of(found: pd.Series) -> str:
+    return _percent(found.success_rate, found.low, found.high)
+
+
+def _percent(rate: float, low: float, high: float) -> str:
+    return _points(100 * rate, 100 * low, 100 * high, " %")
 
 
 def _gap(words: str, found: pd.Series) -> str:

@@ -9,13 +9,18 @@ import pandas as pd
 from scipy.stats import spearmanr
 
 from fedvla_lib import run_folder
+from fedvla_lib.config import Config
 from fedvla_lib.evaluation import statistics
+from fedvla_lib.run_folder import GLOBAL
 
 OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
 OF_RUN = ("partition", "arm", "run")
 # Settings that decide what demonstrations there are and which of them are held out.
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
 BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
+SIDE_BY_SIDE = ("federated", "clients")  # kinds whose clients train at the same time
+ALONE = "local-only"  # the kind whose clients train for themselves
+OWN, OTHER = "own task", "other tasks"
 HELD_OUT = ("loss", "action_error")
 P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
@@ -23,7 +28,10 @@ P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 def read_results(folder: Path) -> pd.DataFrame:
     """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
 
-    train_s is NaN where a cell's stamp has no time of its training.
+    train_s is NaN where a cell's stamp has no time of its training. steps_in_all and steps_in_a_row are the gradient
+    steps of the model that made the attempt. Where `counted` is True it counted them while it trained; cells of before
+    models counted have no counts, and there the numbers follow from the settings: of clients that trained alone, each
+    has its share of the total.
 
     Raises:
         ValueError: there is no result.
@@ -50,7 +58,28 @@ def _attempts(cell: Path) -> pd.DataFrame:
     measured = {name: float(last.get(name, "nan")) for name in HELD_OUT}
     config = run_folder.read_config(cell)
     recording = ", ".join(str(getattr(config, name)) for name in RECORDING)
-    return rows[rows["round"] == last["round"]].assign(**_known(cell), **measured, recording=recording)
+    rows = rows[rows["round"] == last["round"]]
+    steps = _steps(run_folder.read_stamp(cell), config, rows)
+    return rows.assign(**_known(cell), **measured, **steps, recording=recording)
+
+
+def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
+    """Columns counted, steps_in_all and steps_in_a_row: of the model that made each attempt."""
+    counted = stamp.get("steps")
+    each = counted or {GLOBAL: _planned(stamp, config)}
+    alone = rows.client.map("client_{:.0f}".format) if "client" in rows else pd.Series(GLOBAL, rows.index)
+    names = [name if name in each else GLOBAL for name in alone]
+    of_model = {f"steps_{how}": [each[name][how] for name in names] for how in ("in_all", "in_a_row")}
+    return {"counted": counted is not None, **of_model}
+
+
+def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
+    """The steps that the settings ask of each model of a cell that has no counts."""
+    total = stamp["gradient_steps"]
+    if stamp["kind"] == "local-only":
+        total //= config.num_clients
+    in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in SIDE_BY_SIDE else total
+    return {"in_all": total, "in_a_row": in_a_row}
 
 
 def repeat_partition_free(rows: pd.DataFrame) -> pd.DataFrame:
@@ -167,6 +196,9 @@ def disagreements(rounds: pd.DataFrame) -> pd.DataFrame:
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
     """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
 
+    steps_in_all and steps_in_a_row are those of one model; gradient_steps, samples, MB and train_s those of all models
+    of a cell together, which are several where clients train alone.
+
     Args:
         rows: of `read_results`.
         by: columns that make a group; at least partition and arm.
@@ -179,10 +211,73 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.
             **dict(zip(by, group, strict=True)), "seeds": len(cells), "attempts": len(part),
             "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
             "action_error": cells.action_error.mean(),
-            "gradient_steps": cells.gradient_steps.mean(), "samples": cells.samples.mean(),
-            "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
+            "steps_in_all": part.steps_in_all.mean(), "steps_in_a_row": part.steps_in_a_row.mean(),
+            "counted": bool(part.counted.all()), "gradient_steps": cells.gradient_steps.mean(),
+            "samples": cells.samples.mean(), "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
         })  # fmt: skip
     return pd.DataFrame(lines)
+
+
+def at_own_task(rows: pd.DataFrame) -> pd.Series:
+    """Return for each attempt whether it was at the task of the client that trained alone and made it.
+
+    Only with partition `task` has a client one task: client k number k of all in alphabetical order, in turn, as
+    `partition.partition` deals them out. Attempts of other arms, which no client made, are at nobody's own task.
+
+    Args:
+        rows: of `read_results`, of partition `task`, each arm with all tasks.
+    """
+    if "client" not in rows:
+        return pd.Series(False, rows.index)
+    tasks = sorted(rows.task.unique())
+    own = rows.client.map(lambda client: tasks[int(client) % len(tasks)], na_action="ignore")
+    return (rows.kind == ALONE) & (rows.task == own)
+
+
+def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with arms named by the gradient steps of a model of theirs, fewest first.
+
+    The attempts of clients that trained alone are split: those at their own task, and those at the others' tasks.
+
+    Args:
+        rows: of `read_results`, of partition `task`.
+    """
+    part = np.where(rows.kind == ALONE, np.where(at_own_task(rows), f", {OWN}", f", {OTHER}"), "")
+    taken = rows.groupby("arm")[["steps_in_all", "steps_in_a_row"]].transform("mean")
+    steps = [f", {_in_words(*each)}" for each in taken.itertuples(index=False)]
+    order = taken.assign(arm=rows.arm, part=part)
+    order = order.sort_values(list(order), ascending=[True, True, True, False], kind="stable")
+    return rows.assign(arm=rows.arm + part + steps).loc[order.index]
+
+
+def _in_words(in_all: float, in_a_row: float) -> str:
+    return f"{in_all:,.0f} steps" + (f", {in_a_row:,.0f} in a row" if in_a_row < in_all else "")
+
+
+def beside_own_tasks(rows: pd.DataFrame, arm: str, other: str, *, seed: int) -> dict[str, Any]:
+    """Hold clients that trained alone, at their own tasks, against another arm on the same attempts.
+
+    Args:
+        rows: of `read_results`, of partition `task`.
+        arm: whose clients trained alone.
+        other: an arm with the same attempts.
+        seed: of the interval's bootstrap.
+
+    Returns:
+        `compare.paired_difference` of arm - other where both have one training seed in common, else
+        `compare.difference_over_seeds`; also seeds, and for both arms success_rate and other_rate with low and high.
+    """
+    own = rows[(rows.arm == arm) & at_own_task(rows)]
+    key = ["run", "task", "seed"]
+    same = rows[rows.arm == other].merge(own[key], on=key)
+    own = own[own.run.isin(same.run)]
+    both, seeds = pd.concat([own, same], ignore_index=True), int(own.run.nunique())
+    of = statistics.paired_difference if seeds == 1 else statistics.difference_over_seeds
+    found = {"seeds": seeds, **of(both, arm, other, seed=seed)}
+    for name, part in (("success", own), ("other", same)):
+        low, high = statistics.success_interval(part)
+        found |= {f"{name}_rate": float(part.success.mean()), f"{name}_low": low, f"{name}_high": high}
+    return found
 
 
 def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
