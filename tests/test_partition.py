@@ -89,8 +89,8 @@ def test_a_task_that_its_clients_cannot_share_is_named():
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ([[0, 1], [1, 2]], "episode 1 is with client 0 and with client 1"),
-        ([[0], [2]], "episode 1 is with no client"),
+        ([[0, 1], [1, 2]], "episode 1 is assigned to clients 0 and 1"),
+        ([[0], [2]], "episode 1 is assigned to no client"),
         ([[0, 1], [2, 7]], "episode 7 of client 1 is not one of those"),
         ([[0, 1, 2], []], "client 1 has no episode"),
     ],

@@ -17,7 +17,6 @@ from lerobot.datasets import LeRobotDataset
 
 from conftest import heed_interrupts
 from fedvla_lib.data import episode_writer
-from fedvla_lib.data import record as record_module
 from fedvla_lib.data.record import _num_recorded, demonstrate, record
 from fedvla_lib.robot.rollout import Episode
 from fedvla_lib.robot.sim import So100Env
@@ -131,7 +130,7 @@ def test_the_same_command_on_a_complete_folder_changes_nothing(recording):
         ({"tasks": ["place", "lift", "push"]}, "tasks="),
         ({"image_size": 96}, "image_size=64, not 96"),
         ({"seed": 1}, "seed=0, not 1"),
-        ({"episodes_per_task": 3}, "already holds 12 episodes"),
+        ({"episodes_per_task": 3}, "already has 12 episodes"),
     ],
 )
 def test_other_settings_on_an_existing_folder_are_refused(recording, change, reason):
@@ -183,7 +182,7 @@ def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same
             move(source, target)
 
         with monkeypatch.context() as patch:
-            patch.setattr(record_module, "_put", dying)
+            patch.setattr(episode_writer, "_put", dying)
             with pytest.raises(KeyboardInterrupt):
                 write(root, 3)
         dataset = lerobot_opens(root)

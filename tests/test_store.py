@@ -290,7 +290,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: edit_table(
             root / ROWS, lambda table: table.assign(**{STATE_KEY: [np.zeros(7, np.float32)] * len(table)})
         ),
-        rf"{ROWS}, episode 5: observation.state has shape \(7,\), needed is \(6,\)",
+        rf"{ROWS}, episode 5: observation.state has shape \(7,\), but must have \(6,\)",
     ),
     "seven joints in the description": (
         lambda root: edit_info(root, lambda info: info["features"][ACTION_KEY].update(shape=[7])),
@@ -310,7 +310,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "fps of a video": (
         lambda root: shorten_video(root / VIDEO, keep=999, fps=25),
-        rf"{VIDEO}, episode 5: runs at 25 frames per second, meta/info.json says 10",
+        rf"{VIDEO}, episode 5: has 25 frames per second, meta/info.json says 10",
     ),
     "NaN in a state": (
         lambda root: edit_table(root / ROWS, lambda table: set_value(table, STATE_KEY, 3, 5, np.nan)),
@@ -330,7 +330,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "no episodes": (
         lambda root: edit_info(root, lambda info: info.update(total_episodes=0)),
-        "holds no complete episode",
+        "has no complete episode",
     ),
 }
 

@@ -1,5 +1,5 @@
-"""Demonstrations: record them, read anybody's, split and partition episodes, normalise, and make training batches.
+"""Demonstrations: record or read them, split and partition episodes, normalise, and make training batches.
 
-May import `robot`, LeRobot's data sets and torch. Knows no policy and no federation. Start reading with `record`, then
-`batches`; who holds which episodes is in `splits` and `partition`.
+May import `robot`, LeRobot's data sets and torch. Does not know policies or federation. Start reading with `record`,
+then `batches`; `splits` and `partition` assign the episodes to clients.
 """

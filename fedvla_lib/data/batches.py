@@ -1,8 +1,8 @@
-"""From a data set to training batches: split by episode, statistics without a leak, chunks of actions, augmentation.
+"""Training batches from a frame store, optionally with augmented images.
 
 A sample is the observation at one frame and the chunk of actions that starts there (LeRobot's ``delta_timestamps`` of
-``[0, 1 / fps, ...]``). Where the chunk runs over the end of the episode, its last action is repeated and
-``action_is_pad`` is true, so that the loss can leave it out.
+``[0, 1 / fps, ...]``). Past the end of the episode the last action is repeated and ``action_is_pad`` is true, so that
+the loss can mask it.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,39 +17,37 @@ from fedvla_lib.data.augmentation import augmented, to_float
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY, image_key
 
-ORDER_STREAM, AUGMENT_STREAM = 0, 1  # which independent random stream of a seed is meant
+ORDER_STREAM, AUGMENT_STREAM = 0, 1  # independent random streams of one seed
 
 
 def frame_rows(store: FrameStore, episode_ids: Iterable[int]) -> np.ndarray:
     """Return the store's rows of these episodes, int64 (n,), in ascending order.
 
     Raises:
-        ValueError: no episodes, or one that the store lacks.
+        ValueError: no episodes, or one that is not in the store.
     """
     table = store.episodes.set_index("episode_id")
     ids = sorted({int(episode_id) for episode_id in episode_ids})
     unknown = [episode_id for episode_id in ids if episode_id not in table.index]
     if unknown or not ids:
-        raise ValueError(
-            f"{store.root} has no episode {unknown[0]}" if unknown else "no episodes: give at least one id"
-        )
+        raise ValueError(f"{store.root} has no episode {unknown[0]}" if unknown else "no episodes: give at least one")
     return np.concatenate([np.arange(table.at[i, "start"], table.at[i, "end"]) for i in ids])
 
 
 @dataclass(frozen=True, eq=False)
 class Batches:
-    """Training batches; `at(step)` is a pure function of the fields and the step, so that resuming needs no state."""
+    """Training batches; `at(step)` depends only on the fields and the step, so that resuming needs no state."""
 
     store: FrameStore
     episode_ids: Sequence[int]
     chunk_size: int  # actions per sample
     batch_size: int  # samples per batch
-    seed: int  # fixes order and augmentation
+    seed: int  # of order and augmentation
     augment: bool = False
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """The store's rows that these batches draw from, int64 (num_examples,)."""
+        """The store's rows of the training frames, int64 (num_examples,)."""
         return frame_rows(self.store, self.episode_ids)
 
     @property
@@ -58,29 +56,29 @@ class Batches:
         return len(self.rows)
 
     def at(self, step: int) -> dict[str, Any]:
-        """Return the batch of a training step, as `frames` describes it.
+        """Return the batch of a gradient step, in the format of `batch_of_rows`.
 
-        Frames come in a new random order each epoch, each once; a batch may run over the end of an epoch.
+        Every epoch visits each frame once, in a new random order; a batch may span two epochs.
         """
         rng = np.random.default_rng([self.seed, AUGMENT_STREAM, step]) if self.augment else None
         return _batch(self.store, self.rows_at(step), self.chunk_size, rng)
 
     def rows_at(self, step: int) -> np.ndarray:
-        """Return the store's rows of the batch of a training step, int64 (batch_size,)."""
+        """Return the store's rows in the batch of a gradient step, int64 (batch_size,)."""
         return self._order(np.arange(step * self.batch_size, (step + 1) * self.batch_size))
 
-    def _order(self, places: np.ndarray) -> np.ndarray:
-        """Rows at places of the endless sequence that strings the epochs together."""
-        epochs, offsets = np.divmod(places, self.num_examples)
-        picked = np.empty_like(places)
+    def _order(self, positions: np.ndarray) -> np.ndarray:
+        """Return the rows at these positions of the concatenated epochs."""
+        epochs, offsets = np.divmod(positions, self.num_examples)
+        indices = np.empty_like(positions)
         for epoch in np.unique(epochs):
             rng = np.random.default_rng([self.seed, ORDER_STREAM, int(epoch)])
-            picked[epochs == epoch] = rng.permutation(self.num_examples)[offsets[epochs == epoch]]
-        return self.rows[picked]
+            indices[epochs == epoch] = rng.permutation(self.num_examples)[offsets[epochs == epoch]]
+        return self.rows[indices]
 
 
 def batch_of_rows(store: FrameStore, rows: Sequence[int] | np.ndarray, chunk_size: int) -> dict[str, Any]:
-    """Return the batch of these rows as they are, without augmentation.
+    """Return the batch of these rows, without augmentation.
 
     ``observation.images.<camera>``: float32 (B, 3, size, size) in [0, 1]; ``observation.state``: float32 (B, 6);
     ``action``: float32 (B, chunk_size, 6); ``action_is_pad``: bool (B, chunk_size); ``task``: B instructions.
@@ -89,21 +87,18 @@ def batch_of_rows(store: FrameStore, rows: Sequence[int] | np.ndarray, chunk_siz
 
 
 def _batch(store: FrameStore, rows: np.ndarray, chunk_size: int, rng: np.random.Generator | None) -> dict[str, Any]:
-    pictures = {camera: images[rows] for camera, images in store.images.items()}  # uint8 (B, H, W, 3)
-    if rng is None:
-        images = {camera: to_float(picture) for camera, picture in pictures.items()}
-    else:
-        images = augmented(pictures, rng)
-    return {image_key(camera): image for camera, image in images.items()} | targets_of_rows(store, rows, chunk_size)
+    pixels = {camera: images[rows] for camera, images in store.images.items()}  # uint8 (B, H, W, 3)
+    floats = {camera: to_float(images) for camera, images in pixels.items()} if rng is None else augmented(pixels, rng)
+    return {image_key(camera): images for camera, images in floats.items()} | targets_of_rows(store, rows, chunk_size)
 
 
 def targets_of_rows(store: FrameStore, rows: np.ndarray, chunk_size: int) -> dict[str, Any]:
     """Return the batch of these rows without its images."""
-    wanted = rows[:, None] + np.arange(chunk_size)  # (B, chunk)
+    chunk_rows = rows[:, None] + np.arange(chunk_size)  # (B, chunk)
     ends = store.episode_ends[rows][:, None]
     return {
         STATE_KEY: torch.from_numpy(store.states[rows]),
-        ACTION_KEY: torch.from_numpy(store.actions[np.minimum(wanted, ends - 1)]),
-        "action_is_pad": torch.from_numpy(wanted >= ends),
+        ACTION_KEY: torch.from_numpy(store.actions[np.minimum(chunk_rows, ends - 1)]),
+        "action_is_pad": torch.from_numpy(chunk_rows >= ends),
         "task": [store.instructions[row] for row in rows],
     }

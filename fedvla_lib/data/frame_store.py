@@ -1,8 +1,8 @@
 """A data set's frames, decoded once into memory-mapped arrays.
 
-Decoding a random video frame costs milliseconds, reading a row of an array microseconds, and training visits every
-frame many times. So `open_store` reads and checks a data set once, writes one ``.npy`` per camera into the cache and
-from then on only maps the files. This module does not know the format of a data set, nor what a batch is.
+Decoding a random video frame takes milliseconds, reading a row of an array microseconds, and training visits every
+frame many times. `open_store` therefore reads and checks a data set once, writes one ``.npy`` per camera into the cache
+and later only maps the files. This module does not know the data set's file format, nor batches.
 """
 
 import hashlib
@@ -18,16 +18,16 @@ from filelock import FileLock
 from PIL import Image, ImageOps
 from tqdm.auto import tqdm
 
-from fedvla_lib.data.lerobot_reader import Source, locate, read_images, read_source
+from fedvla_lib.data.lerobot_reader import ReadDataset, locate, read_dataset, read_images
 from fedvla_lib.files import cache_dir, new_folder
 from fedvla_lib.robot.spec import JOINT_NAMES
 
-STORE_VERSION = 2  # part of every store's key: raise it when the files of a store change
+STORE_VERSION = 2  # part of every store's key; increase it when the file format of a store changes
 
 
 @dataclass(frozen=True, eq=False)
 class FrameStore:
-    """All frames of a data set, episode after episode; row i of every array is the same moment."""
+    """All frames of a data set, episode after episode; row i of every array is the same frame."""
 
     root: Path  # the data set's folder
     fps: int  # frames per second
@@ -53,7 +53,7 @@ class FrameStore:
 
     @cached_property
     def instructions(self) -> list[str]:
-        """The request in words at each row."""
+        """The instruction of each row."""
         return list(np.repeat(self.episodes["instruction"].to_numpy(dtype=object), self.episodes["num_frames"]))
 
 
@@ -64,39 +64,39 @@ def open_store(
 
     Args:
         source: a folder in LeRobotDataset v3.0 format, or a hub id such as ``lerobot/svla_so100_pickplace``.
-        image_size: side of the square images in pixels; others are shrunk or enlarged with their aspect kept, and
+        image_size: side of the square images in pixels; other sizes are scaled with their aspect ratio kept, and
             padded with black.
         cameras: our camera name -> the data set's, e.g. ``{"front": "wrist"}``; None uses `CAMERA_ALIASES`.
         progress: show a progress bar while decoding.
 
     Raises:
-        DataError: the data set cannot be had or is broken.
+        DataError: the data set cannot be found or is broken.
     """
     root = locate(source)
     key = _fingerprint(root, image_size, cameras)
     folder = cache_dir() / "frames" / key
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.with_suffix(".lock")):  # two processes that open the same data decode it once
+        with FileLock(folder.with_suffix(".lock")):  # so that concurrent processes decode a data set once
             if not folder.is_dir():
-                source_read = read_source(root, cameras)
+                dataset = read_dataset(root, cameras)
                 with new_folder(folder) as draft:
-                    _build(source_read, image_size, draft, progress)
+                    _build(dataset, image_size, draft, progress)
     return _load(root, folder)
 
 
-def _build(source: Source, image_size: int, folder: Path, progress: bool) -> None:
+def _build(dataset: ReadDataset, image_size: int, folder: Path, progress: bool) -> None:
     """Write a store's files into `folder`."""
-    np.save(folder / "states.npy", source.states)
-    np.save(folder / "actions.npy", source.actions)
-    source.episodes.to_json(folder / "episodes.json", orient="records", indent=1)
-    (folder / "store.json").write_text(json.dumps({"fps": source.info["fps"], "cameras": list(source.cameras)}))
-    total = len(source.states) * len(source.cameras)
+    np.save(folder / "states.npy", dataset.states)
+    np.save(folder / "actions.npy", dataset.actions)
+    dataset.episodes.to_json(folder / "episodes.json", orient="records", indent=1)
+    (folder / "store.json").write_text(json.dumps({"fps": dataset.info["fps"], "cameras": list(dataset.cameras)}))
+    total = len(dataset.states) * len(dataset.cameras)
     with tqdm(total=total, desc="decoding frames", unit="frame", disable=not progress, leave=False) as bar:
-        for camera, key in source.cameras.items():
-            shape = (len(source.states), image_size, image_size, 3)
+        for camera, key in dataset.cameras.items():
+            shape = (len(dataset.states), image_size, image_size, 3)
             out = np.lib.format.open_memmap(folder / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
-            for row, image in read_images(source, key):
+            for row, image in read_images(dataset, key):
                 out[row] = fit_square(image, image_size)
                 bar.update()
             out.flush()
@@ -115,15 +115,15 @@ def _load(root: Path, folder: Path) -> FrameStore:
 
 
 def _fingerprint(root: Path, image_size: int, cameras: Mapping[str, str] | None) -> str:
-    """Name of a store: changes with every file of the data set (name, size, time), the size and the cameras."""
+    """Return the name of a store: a hash of the data set's files (name, size, time), the image size and the cameras."""
     paths = sorted(path for part in ("meta", "data", "videos") for path in (root / part).rglob("*") if path.is_file())
     files = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     content = json.dumps([STORE_VERSION, image_size, dict(cameras or {}), files])
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 
 
-def fit_square(picture: np.ndarray, size: int) -> np.ndarray:
-    """Return uint8 (H, W, 3) as uint8 (size, size, 3): scaled with its aspect kept, centred on black."""
-    if picture.shape[:2] == (size, size):
-        return picture
-    return np.asarray(ImageOps.pad(Image.fromarray(picture), (size, size), Image.Resampling.BILINEAR))
+def fit_square(image: np.ndarray, size: int) -> np.ndarray:
+    """Return uint8 (H, W, 3) as uint8 (size, size, 3): scaled with its aspect ratio kept, centred on black."""
+    if image.shape[:2] == (size, size):
+        return image
+    return np.asarray(ImageOps.pad(Image.fromarray(image), (size, size), Image.Resampling.BILINEAR))

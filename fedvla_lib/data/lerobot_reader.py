@@ -1,7 +1,7 @@
-"""Reads any LeRobotDataset v3.0 of an SO-100, from a folder or the hub, and checks what can be wrong with it.
+"""Reads and checks a LeRobotDataset v3.0 of an SO-100, from a folder or the Hugging Face hub.
 
-Whatever does not fit is a `DataError` that names file and episode. This module keeps nothing: `store` writes what it
-yields into arrays.
+Every problem is a `DataError` that names file and episode. This module caches nothing: `data.frame_store` writes what
+it yields into arrays.
 """
 
 import io
@@ -25,24 +25,24 @@ from PIL import Image
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.robot.tasks import task_of
 
-FORMAT = "v3.0"  # of LeRobotDataset
-CAMERA_ALIASES = {  # our camera -> names it has in other people's data sets, best first
+FORMAT = "v3.0"  # version of LeRobotDataset
+CAMERA_ALIASES = {  # our camera -> names in other data sets, preferred first
     "overhead": ("overhead", "top", "up", "above", "phone"),
     "front": ("front", "side", "wrist", "gripper", "laptop"),
 }
 TIMESTAMP_TOLERANCE_S = 1e-3
-FPS_TOLERANCE = 0.01  # relative; containers round frame rates such as 29.97
+FPS_TOLERANCE = 0.01  # relative; video containers round frame rates such as 29.97
 
 
 class DataError(ValueError):
-    """A data set cannot be used; the message names the file, the episode and what is wrong."""
+    """A data set cannot be used; the message names the file, the episode and the problem."""
 
 
 def locate(source: str | Path) -> Path:
-    """Return the folder of a data set: `source` itself, or a hub id's local copy, downloaded if need be.
+    """Return the folder of a data set: `source` itself, or the local copy of a hub id, downloaded if necessary.
 
     Raises:
-        DataError: neither a folder nor a hub id, or the hub cannot be reached or does not have it.
+        DataError: neither a folder nor a hub id, the hub cannot be reached, or it does not have the data set.
     """
     folder = Path(source).expanduser()
     if folder.is_dir():
@@ -52,51 +52,47 @@ def locate(source: str | Path) -> Path:
     if (HF_LEROBOT_HOME / source / "meta/info.json").exists():
         return HF_LEROBOT_HOME / source
     try:
-        return Path(
-            snapshot_download(str(source), repo_type="dataset", revision=FORMAT, cache_dir=HF_LEROBOT_HUB_CACHE)
-        )
+        folder = snapshot_download(str(source), repo_type="dataset", revision=FORMAT, cache_dir=HF_LEROBOT_HUB_CACHE)
+        return Path(folder)
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, OSError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise DataError(
-            f"cannot get data set {str(source)!r} from the Hugging Face hub ({type(error).__name__}: {reason}); where "
-            f"there is a network run `hf download {source} --repo-type dataset --revision {FORMAT} --local-dir DIR` "
+            f"cannot get data set {str(source)!r} from the Hugging Face hub ({type(error).__name__}: {reason}); with a "
+            f"network connection run `hf download {source} --repo-type dataset --revision {FORMAT} --local-dir DIR` "
             "and give the folder DIR instead of the id"
         ) from error
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """A data set whose metadata and rows have been read and checked; its pictures have not."""
+class ReadDataset:
+    """The checked metadata and rows of a data set, without its images."""
 
     root: Path
     info: dict[str, Any]  # meta/info.json
-    cameras: dict[str, str]  # our name -> feature key
-    files: pd.DataFrame  # meta/episodes: in which files each episode is, and where
-    episodes: pd.DataFrame  # as in FrameStore
+    cameras: dict[str, str]  # our camera -> feature key
+    files: pd.DataFrame  # meta/episodes: the files of each episode, and its position in them
+    episodes: pd.DataFrame  # this and the arrays as in `FrameStore`
     states: np.ndarray
     actions: np.ndarray
 
 
-def read_source(root: Path, cameras: Mapping[str, str] | None) -> Source:
+def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
+    """Read and check everything but the images.
+
+    Raises:
+        DataError: the data set is broken, or is not of an SO-100.
+    """
     info = _read_info(root)
     _check_features(root, info)
     files = _read_episodes(root, info)
     states, actions, labs = _read_rows(root, info, files)
-    lengths = files["length"].to_numpy()
+    lengths, ids = files["length"].to_numpy(), files["episode_index"].astype(int)
     ends = np.cumsum(lengths)
-    instructions = [tasks[0] for tasks in files["tasks"]]
-    episodes = pd.DataFrame(
-        {
-            "episode_id": files["episode_index"].astype(int),
-            "start": ends - lengths,
-            "end": ends,
-            "num_frames": lengths,
-            "instruction": instructions,
-            "task": [task_of(text) for text in instructions],
-            "lab": labs,
-        }
-    )
-    return Source(root, info, _map_cameras(root, info, cameras), files, episodes, states, actions)
+    episodes = pd.DataFrame({"episode_id": ids, "start": ends - lengths, "end": ends, "num_frames": lengths})
+    episodes["instruction"] = [tasks[0] for tasks in files["tasks"]]
+    episodes["task"] = [task_of(text) for text in episodes["instruction"]]
+    episodes["lab"] = labs
+    return ReadDataset(root, info, _map_cameras(root, info, cameras), files, episodes, states, actions)
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -104,7 +100,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     try:
         info = json.loads(path.read_text())
     except FileNotFoundError:
-        raise DataError(f"{path} is missing: {root} is not a LeRobotDataset, or its recording never began") from None
+        raise DataError(f"{path} is missing: {root} is not a LeRobotDataset, or its recording never started") from None
     except json.JSONDecodeError as error:
         raise DataError(f"{path} is not JSON: {error}") from error
     if info.get("codebase_version") != FORMAT:
@@ -116,53 +112,52 @@ def _read_info(root: Path) -> dict[str, Any]:
 
 
 def _check_features(root: Path, info: dict[str, Any]) -> None:
-    """State and action must be six numbers with the names of the SO-100's joints, in their order."""
+    """Require state and action to be six numbers with the names and the order of the SO-100's joints."""
+    path = root / "meta/info.json"
     for key in (STATE_KEY, ACTION_KEY):
         feature = info["features"].get(key)
         if feature is None:
-            raise DataError(f"{root / 'meta/info.json'} has no feature {key}: every episode lacks it")
+            raise DataError(f"{path} has no feature {key}: every episode lacks it")
         if tuple(feature["shape"]) != (NUM_JOINTS,):
-            raise DataError(
-                f"{root / 'meta/info.json'}, every episode: {key} has shape {tuple(feature['shape'])}, "
-                f"an SO-100 has ({NUM_JOINTS},)"
-            )
+            shape = tuple(feature["shape"])
+            raise DataError(f"{path}, every episode: {key} has shape {shape}, an SO-100 has ({NUM_JOINTS},)")
         names = _flat_names(feature.get("names"))
         if [_plain(name) for name in names] != [_plain(name) for name in JOINT_NAMES]:
             raise DataError(
-                f"{root / 'meta/info.json'}, every episode: {key} has the columns {', '.join(names) or 'nothing'}, "
-                f"needed are {', '.join(JOINT_NAMES)} in this order"
+                f"{path}, every episode: {key} has the columns {', '.join(names) or 'nothing'}, "
+                f"but must have {', '.join(JOINT_NAMES)} in this order"
             )
 
 
 def _flat_names(names: Any) -> list[str]:
-    """Names come as a list or as ``{"motors": [...]}``."""
+    """Flatten names given as a list or as ``{"motors": [...]}``."""
     if isinstance(names, Mapping):
         names = [name for part in names.values() for name in part]
     return [str(name) for name in names or []]
 
 
 def _plain(name: str) -> str:
-    """``main_shoulder_pan`` and ``shoulder_pan.pos`` are the same joint."""
+    """Return the joint name that ``main_shoulder_pan`` and ``shoulder_pan.pos`` share."""
     return name.removeprefix("main_").removesuffix(".pos")
 
 
 def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | None) -> dict[str, str]:
-    """Our camera -> feature key, by the given mapping or by the names people commonly use."""
-    found = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    keys = {key.removeprefix(IMAGE_PREFIX): key for key in found}
+    """Return our camera -> feature key, from the given mapping or `CAMERA_ALIASES`."""
+    image_features = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
+    keys = {key.removeprefix(IMAGE_PREFIX): key for key in image_features}
     wanted = {ours: (name.removeprefix(IMAGE_PREFIX),) for ours, name in cameras.items()} if cameras else CAMERA_ALIASES
     mapping = {ours: keys[name] for ours, names in wanted.items() for name in reversed(names) if name in keys}
     missing = [ours for ours in wanted if ours not in mapping]
-    if missing and (cameras or len(found) >= len(CAMERAS) or not mapping):
+    if missing and (cameras or len(image_features) >= len(CAMERAS) or not mapping):
         raise DataError(
-            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: say "
-            f"which to use, for instance cameras={{{missing[0]!r}: {next(iter(keys), 'NAME')!r}}}"
+            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: "
+            f"specify it, for instance cameras={{{missing[0]!r}: {next(iter(keys), 'NAME')!r}}}"
         )
     return mapping
 
 
 def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
-    """Episode table of the data set, by episode number; rows that info.json does not count are left out."""
+    """Return the episode table in order, without rows that info.json does not count."""
     tables = []
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         file = _parquet(path, "all")
@@ -170,14 +165,12 @@ def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
         tables.append(file.read(columns=columns).to_pandas())
     total = info["total_episodes"]
     if not total:
-        raise DataError(f"{root} holds no complete episode: record some first")
+        raise DataError(f"{root} has no complete episode: record some first")
     table = pd.concat(tables) if tables else pd.DataFrame({"episode_index": []})
     table = table.sort_values("episode_index").set_index("episode_index", drop=False)
     lacking = sorted(set(range(total)) - set(table.index))
     if lacking:
-        raise DataError(
-            f"{root / 'meta/episodes'}: episode {lacking[0]} is not listed, info.json counts {total} episodes"
-        )
+        raise DataError(f"{root / 'meta/episodes'}: episode {lacking[0]} is not listed, info.json counts {total}")
     return table.loc[range(total)].reset_index(drop=True)
 
 
@@ -191,18 +184,19 @@ def _parquet(path: Path, episodes: Any) -> pq.ParquetFile:
 
 
 def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """States and actions of all episodes, float32 (N, 6) each, checked, and the laboratory of each episode."""
+    """Return checked states and actions of all episodes, float32 (N, 6) each, and the lab of each episode."""
     columns = ["episode_index", "timestamp", STATE_KEY, ACTION_KEY]
     has_labs = LAB_KEY in info["features"]
     columns += [LAB_KEY] if has_labs else []
     parts: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for (chunk, file), group in files.groupby(["data/chunk_index", "data/file_index"]):
+        first_id = group["episode_index"].iloc[0]
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
-        source = _parquet(path, group["episode_index"].iloc[0])
-        lacking = [name for name in columns if name not in source.schema_arrow.names]
+        parquet = _parquet(path, first_id)
+        lacking = [name for name in columns if name not in parquet.schema_arrow.names]
         if lacking:
-            raise DataError(f"{path} (episode {group['episode_index'].iloc[0]}) has no column {', '.join(lacking)}")
-        table = source.read(columns=columns).to_pandas()
+            raise DataError(f"{path} (episode {first_id}) has no column {', '.join(lacking)}")
+        table = parquet.read(columns=columns).to_pandas()
         for episode_id, length in zip(group["episode_index"], group["length"], strict=True):
             rows = table[table["episode_index"] == episode_id]
             lab = int(rows[LAB_KEY].iloc[0]) if has_labs and len(rows) else 0
@@ -214,50 +208,52 @@ def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[n
 def _check_rows(
     path: Path, episode_id: int, rows: pd.DataFrame, length: int, fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States and actions of one episode, float32 (T, 6)."""
-    where = f"{path}, episode {episode_id}"
+    """Return states and actions of one episode, float32 (T, 6)."""
+    episode = f"{path}, episode {episode_id}"
     if len(rows) != length:
-        raise DataError(f"{where}: has {len(rows)} frames, its metadata says {length}")
+        raise DataError(f"{episode}: has {len(rows)} frames, its metadata says {length}")
     drift = np.abs(rows["timestamp"].to_numpy() - np.arange(length) / fps)
     if drift.max() > max(TIMESTAMP_TOLERANCE_S, 1e-6 * length):
         frame = int(np.argmax(drift > TIMESTAMP_TOLERANCE_S))
         raise DataError(
-            f"{where}: frame {frame} is at {rows['timestamp'].iloc[frame]:.4f} s, but at fps={fps} "
-            f"it belongs at {frame / fps:.4f} s"
+            f"{episode}: frame {frame} is at {rows['timestamp'].iloc[frame]:.4f} s, but at fps={fps} "
+            f"it should be at {frame / fps:.4f} s"
         )
-    return _vectors(where, STATE_KEY, rows[STATE_KEY]), _vectors(where, ACTION_KEY, rows[ACTION_KEY])
+    return _vectors(episode, STATE_KEY, rows[STATE_KEY]), _vectors(episode, ACTION_KEY, rows[ACTION_KEY])
 
 
-def _vectors(where: str, key: str, column: pd.Series) -> np.ndarray:
-    """A column of six-vectors as float32 (T, 6), all finite."""
+def _vectors(episode: str, key: str, column: pd.Series) -> np.ndarray:
+    """Return a column of six-vectors as float32 (T, 6), all finite."""
     shapes = sorted({np.shape(value) for value in column})
     if shapes != [(NUM_JOINTS,)]:
-        raise DataError(
-            f"{where}: {key} has shape {shapes[0] if len(shapes) == 1 else shapes}, needed is ({NUM_JOINTS},)"
-        )
+        shape = shapes[0] if len(shapes) == 1 else shapes
+        raise DataError(f"{episode}: {key} has shape {shape}, but must have ({NUM_JOINTS},)")
     values = np.stack(column.to_list()).astype(np.float32)
     if not np.isfinite(values).all():
         frame, joint = np.argwhere(~np.isfinite(values))[0]
-        raise DataError(f"{where}: {key} of frame {frame} is {values[frame, joint]} at {JOINT_NAMES[joint]}")
+        raise DataError(f"{episode}: {key} of frame {frame} is {values[frame, joint]} at {JOINT_NAMES[joint]}")
     return values
 
 
-def read_images(source: Source, key: str) -> Iterator[tuple[int, np.ndarray]]:
-    """Every frame of one camera as (store row, uint8 (H, W, 3)); all rows come exactly once."""
-    is_video = source.info["features"][key]["dtype"] == "video"
-    kind, pattern, read = (
-        ("videos/" + key, "video_path", _video_images) if is_video else ("data", "data_path", _still_images)
-    )
-    starts = source.episodes["start"].to_numpy()
-    for (chunk, file), group in source.files.groupby([f"{kind}/chunk_index", f"{kind}/file_index"]):
-        path = source.root / source.info[pattern].format(video_key=key, chunk_index=chunk, file_index=file)
-        yield from read(path, key, group, starts[group.index], source.info["fps"])
+def read_images(dataset: ReadDataset, key: str) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield each frame of one camera once, as (store row, uint8 (H, W, 3)).
+
+    Raises:
+        DataError: a file is missing or damaged.
+    """
+    info, starts = dataset.info, dataset.episodes["start"].to_numpy()
+    kind, pattern, read = "data", "data_path", _still_images
+    if info["features"][key]["dtype"] == "video":
+        kind, pattern, read = f"videos/{key}", "video_path", _video_images
+    for (chunk, file), group in dataset.files.groupby([f"{kind}/chunk_index", f"{kind}/file_index"]):
+        path = dataset.root / info[pattern].format(video_key=key, chunk_index=chunk, file_index=file)
+        yield from read(path, key, group, starts[group.index], info["fps"])
 
 
 def _video_images(
     path: Path, key: str, group: pd.DataFrame, starts: np.ndarray, fps: float
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Frames of the episodes in `group`, which share the video `path`; the frame at t s is number t * fps."""
+    """Yield the frames of the episodes in `group`, all in the video `path`; the frame at t s has number t * fps."""
     first = np.round(group[f"videos/{key}/from_timestamp"].to_numpy() * fps).astype(int)
     lengths = group["length"].to_numpy()
     rows = {
@@ -265,20 +261,20 @@ def _video_images(
         for frame, start, length in zip(first, starts, lengths, strict=True)
         for step in range(length)
     }
-    for number, picture in _decode(path, fps, group["episode_index"].iloc[0]):
+    for number, image in _decode(path, fps, group["episode_index"].iloc[0]):
         if number in rows:
-            yield rows.pop(number), picture
+            yield rows.pop(number), image
     if rows:
         row = min(rows.values())
-        place = int(np.searchsorted(starts, row, side="right")) - 1
+        i = int(np.searchsorted(starts, row, side="right")) - 1
         raise DataError(
-            f"{path}, episode {group['episode_index'].iloc[place]}: the video lacks frame {row - starts[place]} of "
-            f"{lengths[place]}; it is cut off or damaged"
+            f"{path}, episode {group['episode_index'].iloc[i]}: the video lacks frame {row - starts[i]} of "
+            f"{lengths[i]}; it is cut off or damaged"
         )
 
 
 def _decode(path: Path, fps: float, episode_id: int) -> Iterator[tuple[int, np.ndarray]]:
-    """All frames of a video as (number, uint8 (H, W, 3)); stops where the file cannot be decoded any further."""
+    """Yield the frames of a video as (number, uint8 (H, W, 3)) until its end or a decoding error."""
     if not path.exists():
         raise DataError(f"{path} is missing (episode {episode_id})")
     try:
@@ -287,13 +283,11 @@ def _decode(path: Path, fps: float, episode_id: int) -> Iterator[tuple[int, np.n
         raise DataError(f"{path} cannot be opened as a video (episode {episode_id}): {error.strerror}") from error
     with container:
         if not container.streams.video:
-            raise DataError(f"{path} holds no video (episode {episode_id})")
+            raise DataError(f"{path} contains no video (episode {episode_id})")
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 0)
         if abs(rate - fps) > FPS_TOLERANCE * fps:
-            raise DataError(
-                f"{path}, episode {episode_id}: runs at {rate:g} frames per second, meta/info.json says {fps}"
-            )
+            raise DataError(f"{path}, episode {episode_id}: has {rate:g} frames per second, meta/info.json says {fps}")
         yield from _decode_stream(container, stream, fps)
 
 
@@ -303,20 +297,19 @@ def _decode_stream(container: Any, stream: Any, fps: float) -> Iterator[tuple[in
         try:
             frame = next(frames)
         except (StopIteration, av.FFmpegError):
-            return  # the caller knows which frames it still needs and says so
+            return  # the caller reports the frames that are missing
         yield round(float(frame.pts * stream.time_base) * fps), frame.to_ndarray(format="rgb24")
 
 
 def _still_images(
     path: Path, key: str, group: pd.DataFrame, starts: np.ndarray, fps: float
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Frames stored as compressed pictures in the rows of a parquet file."""
+    """Yield frames that are stored as compressed images in the rows of a parquet file."""
     table = _parquet(path, group["episode_index"].iloc[0]).read(columns=["episode_index", key]).to_pandas()
     for episode_id, start in zip(group["episode_index"], starts, strict=True):
         for step, cell in enumerate(table.loc[table["episode_index"] == episode_id, key]):
             try:
                 yield start + step, np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB"))
             except (OSError, TypeError) as error:
-                raise DataError(
-                    f"{path}, episode {episode_id}: picture {step} of {key} cannot be read: {error}"
-                ) from error
+                message = f"{path}, episode {episode_id}: image {step} of {key} cannot be read: {error}"
+                raise DataError(message) from error

