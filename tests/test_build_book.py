@@ -8,6 +8,7 @@ import yaml
 
 import build_book
 from build_book import BookError, Chapter
+from fedvla_book import tables
 from fedvla_lib.experiments import results
 
 ROOT = Path(__file__).parent.parent
@@ -248,7 +249,7 @@ def test_the_front_page_says_what_the_stored_comparison_found():
     in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
     assert f"After {in_all} gradient steps in all" in said and f"has walked {in_a_row} steps in a row" in said
     assert set(stored.partition) <= set(build_book.DEALT)
-    gaps = results.differences(results.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
+    gaps = results.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
         words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
         assert words in said.split("Federated minus pooled: ")[1].split("\n")[0]
@@ -265,7 +266,7 @@ def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_judg
     steps = {arm: part.steps_in_all.unique().item() for arm, part in (("share", share), ("longer", longer))}
     assert f"only its share of the steps, {steps['share']}, succeeds in {100 * share.success.mean():.1f} % [" in said
     assert "no measure of what a lab can do alone" in said and "is not answered by this grid" in said
-    own = longer[results.at_own_task(longer)]
+    own = longer[tables.at_own_task(longer)]
     federated = stored[(stored.arm == "fedavg-200x2x2") & stored.run.isin(own.run)]
     same = federated.merge(own[["run", "task", "seed"]], on=["run", "task", "seed"])
     assert len(same) == len(own) and own.counted.all()

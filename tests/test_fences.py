@@ -1,30 +1,46 @@
-"""The house rules about imports: who may use which heavy package, and that imports run one way."""
+"""The house rules about imports: the order of the rooms, who may use which heavy package, and that no circle exists."""
 
 import ast
+import subprocess
+import sys
 import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
+import library
 from fedvla_lib.config import Config, to_run_config
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
-MODULES = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "fedvla_lib").glob("*.py")}
-TOP = {"doctor", "cli"}  # look at everything, from inside functions
+MODULES = library.modules(ROOT)  # raises if there is none
+BOOK = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "book" / "fedvla_book").rglob("*.py")}
+# A room may import itself and what stands before it.
+ORDER = (
+    library.ROOT_FILES, "robot", "data", "policy", "evaluation", "federation", "pretraining", "engines", "experiments",
+    "cli",
+)  # fmt: skip
+ROOT_ORDER = ("config", "files", "provenance", "run_folder")
+APART = {"pretraining": {"federation"}}  # before it in the list, and still not its business
+STRATEGIES = "federation.strategies"
 
-APPS = {"client_app", "server_app"}
+# Heavy package -> rooms or modules that may import it, anywhere in them but the commands, which import when they run.
 FENCES = {
-    "mujoco": {"sim", "scene", "expert"},
-    "mink": {"expert"},
-    "torch": {"model", "params", "train", "prefix", "data", "ground", "corrections", "lora", "full_size"},
-    "lerobot": {"model", "train", "prefix", "data", "source", "record", "lerobot_env", "full_size"},
-    "flwr": {"wire", "roster", "grid", "strategies", "engine"} | APPS,
-    "flwr_datasets": {"partition"},
-    "matplotlib": {"plots"},
+    "mujoco": {"robot"},
+    "mink": {"robot.expert"},
+    "gymnasium": {"robot"},
+    "torch": {
+        "policy", "data.augmentation", "data.batches", "evaluation.held_out", "pretraining.grounding",
+        f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
+    },
+    "lerobot": {"robot.lerobot_env", "data", "policy"},
+    "transformers": {"policy"},
+    "flwr": {"federation", "engines"},
+    "flwr_datasets": {"data.partition"},
+    "matplotlib": {"evaluation.figures"},
     "ray": set(),
-}
+}  # fmt: skip
 
 
 def imports(tree: ast.AST) -> set[str]:
@@ -40,44 +56,126 @@ def imports(tree: ast.AST) -> set[str]:
 
 def ours(name: str) -> set[str]:
     """The modules of ours that a module imports."""
-    parts = [imported.split(".") for imported in imports(MODULES[name]) if imported.startswith("fedvla_lib.")]
-    return {part[1] for part in parts if part[1] in MODULES}
+    inside = {one.removeprefix("fedvla_lib.") for one in imports(MODULES[name]) if one.startswith("fedvla_lib.")}
+    return {part for one in inside for part in (one, one.rpartition(".")[0]) if part in MODULES}
+
+
+def stands_in(name: str, places: set[str]) -> bool:
+    return any(f"{name}.".startswith(f"{place}.") for place in places)
+
+
+def upward(names, imported) -> list[tuple[str, str]]:
+    """Imports that go against the order of rooms, or into a room that is not the importer's business."""
+    found = []
+    for name in names:
+        for other in imported(name):
+            room, used = library.room_of(name), library.room_of(other)
+            if ORDER.index(used) > ORDER.index(room) or used in APART.get(room, ()):
+                found.append((name, other))
+    return found
+
+
+def test_there_are_modules_in_every_room():
+    assert {library.room_of(name) for name in MODULES} == set(ORDER)
+    assert {name for name in MODULES if library.room_of(name) == library.ROOT_FILES} == set(ROOT_ORDER)
+    assert len(MODULES) > 60 and f"{STRATEGIES}.scaffold" in MODULES
+
+
+def test_a_folder_without_modules_is_an_error(tmp_path):
+    (tmp_path / "fedvla_lib").mkdir()
+    with pytest.raises(ValueError, match="holds no module"):
+        library.modules(tmp_path)
+
+
+def test_rooms_import_in_one_direction():
+    assert not upward(MODULES, ours)
+
+
+def test_an_import_against_the_order_is_found():
+    turned = {"robot.sim": {"cli.doctor"}, "pretraining.pretrain": {"federation.client"}, "data.record": {"robot.sim"}}
+    found = upward(turned, turned.__getitem__)
+    assert found == [("robot.sim", "cli.doctor"), ("pretraining.pretrain", "federation.client")]
+
+
+def test_no_module_imports_itself_through_others():
+    order = list(TopologicalSorter({name: ours(name) for name in MODULES}).static_order())
+    assert order.index("robot.spec") < order.index("engines.inline")
+    for place, name in enumerate(ROOT_ORDER):
+        assert ours(name) <= set(ROOT_ORDER[:place])
 
 
 @pytest.mark.parametrize("package", FENCES)
 def test_heavy_packages_stay_behind_their_fence(package):
     users = {name for name, tree in MODULES.items() if any(i.split(".")[0] == package for i in imports(tree))}
-    assert users - TOP <= FENCES[package]
+    assert [name for name in users if library.room_of(name) != "cli" and not stands_in(name, FENCES[package])] == []
+    assert not FENCES[package] or users, f"nobody imports {package}: the fence guards nothing"
 
 
-def test_exercises_are_light_and_nothing_leans_on_them():
+def test_only_the_engines_import_the_apps():
+    apps = {"federation.client_app", "federation.server_app"}
+    assert {name for name in MODULES if ours(name) & apps} == {"engines.inline"}
+
+
+def test_a_package_holds_a_paragraph_and_no_imports():
+    """Else asking for one module loads a whole room: `fedvla --help` would load torch."""
+    for file in (ROOT / "fedvla_lib").rglob("*/__init__.py"):
+        tree = ast.parse(file.read_text())
+        assert len(tree.body) == 1, file
+        text = ast.get_docstring(tree)
+        assert "May import" in text and "Start reading" in text, file
+
+
+def test_help_loads_neither_torch_nor_flower():
+    code = (
+        "import contextlib, sys\nfrom fedvla_lib.cli.main import main\n"
+        "with contextlib.suppress(SystemExit): main(['run', '--help'])\n"
+        "sys.exit(' '.join(sorted({'torch', 'flwr', 'lerobot', 'mujoco', 'ray'} & set(sys.modules))) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and "--num-clients" in done.stdout, done.stderr
+
+
+def test_exercises_are_light_and_the_library_does_not_know_the_book():
     """A reader's answer is checked at once; the library does not depend on what chapters ask."""
-    own = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "fedvla_lib" / "exercises").glob("*.py")}
-    assert not [name for name, tree in own.items() if {i.split(".")[0] for i in imports(tree)} & set(FENCES)]
-    assert not [name for name, tree in MODULES.items() if any("exercises" in i for i in imports(tree))]
+    own = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "book/fedvla_book/exercises").glob("*.py")}
+    assert own and not [n for n, tree in own.items() if {i.split(".")[0] for i in imports(tree)} & set(FENCES)]
+    assert not [name for name, tree in MODULES.items() if any("fedvla_book" in i for i in imports(tree))]
 
 
 def test_nothing_can_load_a_pickle():
     """Weights are safetensors; whoever imports one of these could run what a stranger sent."""
+    everything = MODULES | BOOK
     loaders = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
-    assert not {name for name, tree in MODULES.items() if {i.split(".")[0] for i in imports(tree)} & loaders}
-    called = {name: ast.unparse(tree) for name, tree in MODULES.items()}
+    assert not {name for name, tree in everything.items() if {i.split(".")[0] for i in imports(tree)} & loaders}
     words = ("torch.load", "read_pickle", "allow_pickle=True")
-    assert not {name for name, code in called.items() if any(word in code for word in words)}
-
-
-def test_imports_run_one_way():
-    order = list(TopologicalSorter({name: ours(name) for name in MODULES}).static_order())
-    assert order.index("spec") < order.index("engine")
-    assert not ours("spec") and not ours("config")
-
-
-def test_only_the_engine_imports_the_apps():
-    assert {name for name in MODULES if ours(name) & APPS} == {"engine"}
+    assert not {name for name, tree in everything.items() if any(word in ast.unparse(tree) for word in words)}
 
 
 def test_there_is_no_drawer_for_odds_and_ends():
-    assert not {"utils", "helpers", "common", "misc"} & set(MODULES)
+    assert not {"utils", "helpers", "common", "misc"} & {part for name in MODULES for part in name.split(".")}
+
+
+def sizes():
+    """Yield (what, size, limit) of every file and function of the library."""
+    for name, tree in MODULES.items():
+        file = ROOT / "fedvla_lib" / f"{name.replace('.', '/')}.py"
+        yield name, len(file.read_text().splitlines()), 350
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                arguments += [one for one in (node.args.vararg, node.args.kwarg) if one]
+                count = len([one for one in arguments if one.arg not in ("self", "cls")])
+                yield f"{name}.{node.name}", node.end_lineno - node.lineno + 1, 40
+                yield f"parameters of {name}.{node.name}", count, 8
+
+
+def test_files_and_functions_stay_small():
+    assert [(what, size) for what, size, limit in sizes() if size > limit] == []
+
+
+def test_the_library_stays_small():
+    files = [*(ROOT / "fedvla_lib").rglob("*.py")]
+    assert sum(len(file.read_text().splitlines()) for file in files) <= 10_000
 
 
 def test_the_flower_app_has_every_setting_with_its_default():

@@ -10,7 +10,7 @@ from fedvla_lib.policy import model
 from fedvla_lib.policy.training import Objective, local_train
 from fedvla_lib.pretraining import grounding, pretrain
 from fedvla_lib.pretraining.recipe import Recipe
-from fedvla_lib.pretraining.scenes import THINGS, draw_scenes
+from fedvla_lib.pretraining.scenes import OBJECTS, draw_scenes
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY
 from fedvla_lib.robot.tasks import ALL_TASKS
 
@@ -38,8 +38,8 @@ def test_what_is_drawn_at_a_things_place_has_its_colour(scenes):
     seen = right = 0
     for row in range(SMALL.scenes):
         for camera, name in enumerate(CAMERAS):
-            for thing, strongest in channel.items():
-                share = scenes.shares[row, camera, THINGS.index(thing)]
+            for obj, strongest in channel.items():
+                share = scenes.shares[row, camera, OBJECTS.index(obj)]
                 if np.isfinite(share).all() and (share >= 0).all() and (share < 1).all():
                     across, down = (share * 64).astype(int)
                     seen += 1
@@ -60,11 +60,11 @@ def test_scenes_vary_and_are_drawn_once(scenes, tmp_path):
 def test_a_sentence_names_what_is_there_and_says_where_in_it():
     rng = np.random.default_rng(0)
     for _ in range(50):
-        there = rng.permutation(len(THINGS))[: rng.integers(1, 5)]
+        there = rng.permutation(len(OBJECTS))[: rng.integers(1, 5)]
         text, phrases = grounding.sentence(there, rng)
         assert 1 <= len(phrases) <= grounding.MOST_NAMED
-        assert {thing for thing, _, _ in phrases} <= set(there)
-        assert all(text[start:end] == THINGS[thing] for thing, start, end in phrases)
+        assert {obj for obj, _, _ in phrases} <= set(there)
+        assert all(text[start:end] == OBJECTS[obj] for obj, start, end in phrases)
 
 
 def test_no_sentence_is_one_of_a_task():
@@ -85,9 +85,9 @@ def test_the_tokens_of_a_phrase_spell_it(scenes, bundle):
     tokens = bundle.preprocess({key: batch[key] for key in (STATE_KEY, "task")})["observation.language.tokens"]
     spell = bundle.policy.model.vlm_with_expert.processor.tokenizer.decode
     for row in range(8):
-        for thing in set(batch["named"][batch["named"][:, 0] == row, 2].tolist()):
-            mine = (batch["named"][:, 0] == row) & (batch["named"][:, 2] == thing)
-            assert spell(tokens[row, batch["named"][mine, 1]]).strip() == THINGS[thing]
+        for obj in set(batch["named"][batch["named"][:, 0] == row, 2].tolist()):
+            mine = (batch["named"][:, 0] == row) & (batch["named"][:, 2] == obj)
+            assert spell(tokens[row, batch["named"][mine, 1]]).strip() == OBJECTS[obj]
     assert torch.equal(questions.at(4)["named"], questions.at(4)["named"])
 
 

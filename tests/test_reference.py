@@ -8,16 +8,17 @@ from pathlib import Path
 
 import pytest
 
+from fedvla_book import tables
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
-from fedvla_lib.experiments import methods, results, search
+from fedvla_lib.experiments import methods, results
 from fedvla_lib.experiments.plan import read_plan
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "book" / "reference"
 CELLS = sorted(stamp.parent for stamp in REFERENCE.glob("*/*/stamp.json"))
-SEARCHES = search.read_searches(REFERENCE / "search")
+SEARCHES = tables.read_searches(REFERENCE / "search")
 # Not results: the customary confidence, level and power, and the differences that examples set out to find.
 CUSTOMARY = {"95 %", "80 %", "5 %", "10 points"}
 RESULT = re.compile(r"\d[\d.,]*\s?(?:%|percent\b|points\b)")

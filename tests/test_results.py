@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from fedvla_book import tables
 from fedvla_lib.data import partition as partition_module
 from fedvla_lib.experiments import results
 
@@ -26,13 +27,13 @@ def test_correlations_are_of_ranks_within_each_run_and_over_all():
         ("a", 0, 1, 9.0, 0, 10), ("a", 0, 2, 0.3, 1, 10), ("a", 0, 3, 0.2, 9, 10), ("a", 0, 4, 0.1, 0, 0),
         ("b", 0, 1, 0.5, 2, 10), ("b", 0, 2, 0.6, 3, 10), ("b", 1, 1, 0.7, 4, 10), ("b", 1, 2, 0.8, 4, 10),
     )  # fmt: skip
-    found = results.correlations(table)
+    found = tables.correlations(table)
     assert found[["arm", "run"]].values.tolist() == [["a", 0], ["b", 0], ["b", 1], ["all", "all"]]
     assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without an attempt is none
     np.testing.assert_allclose(found.rho[:3], [-1, 1, np.nan])  # all alike: no rank, and no warning
     seen = table[table.n > 0]
     assert found.rho.iloc[-1] == pytest.approx(seen.loss.rank().corr(seen.success_rate.rank()))
-    assert results.correlations(table, ["run"])[["arm", "run", "n"]].values.tolist() == [
+    assert tables.correlations(table, ["run"])[["arm", "run", "n"]].values.tolist() == [
         ["all", 0, 5], ["all", 1, 2], ["all", "all", 7],
     ]  # fmt: skip
 
@@ -42,14 +43,14 @@ def test_clear_pairs_are_apart_and_disagreements_are_those_that_the_loss_mislead
         ("a", 0, 1, 0.5, 0, 60), ("a", 0, 2, 0.2, 30, 60), ("b", 0, 1, 0.3, 58, 60), ("b", 1, 1, 0.1, 10, 60),
         ("b", 1, 2, 0.2, 60, 60), ("b", 1, 3, 0.05, 0, 0),
     )  # fmt: skip
-    pairs = results.clear_pairs(table)
+    pairs = tables.clear_pairs(table)
     assert (pairs.loss < pairs.other_loss).all() and (pairs.gap > 0).all()
     apart = (pairs.low > pairs.other_high) | (pairs.high < pairs.other_low)
     assert apart.all() and len(pairs) == 8  # of 10: one has equal losses, in one the intervals overlap
     assert pairs.same_run.sum() == 2 and pairs.same_episodes.sum() == 4
     assert not pairs[pairs.same_run & (pairs.arm == "a")].misled.any()
 
-    found = results.disagreements(table)
+    found = tables.disagreements(table)
     assert (found.success_rate < found.other_success_rate).all() and found.gap.is_monotonic_decreasing
     named = found[["arm", "run", "round", "other_arm", "other_run", "other_round"]].values.tolist()
     assert named == [["b", 1, 1, "b", 1, 2], ["b", 1, 1, "b", 0, 1], ["a", 0, 2, "b", 0, 1], ["b", 1, 1, "a", 0, 2]]
@@ -58,8 +59,8 @@ def test_clear_pairs_are_apart_and_disagreements_are_those_that_the_loss_mislead
 
 def test_without_a_clear_pair_the_tables_are_empty():
     for table in (rounds(("a", 0, 1, 0.5, 1, 2), ("a", 0, 2, 0.2, 0, 2)), rounds(("a", 0, 1, 0.5, 0, 0))):
-        assert len(results.clear_pairs(table)) == len(results.disagreements(table)) == 0
-    assert np.isnan(results.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
+        assert len(tables.clear_pairs(table)) == len(tables.disagreements(table)) == 0
+    assert np.isnan(tables.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
 
 
 def attempts(*cells):
@@ -78,7 +79,7 @@ def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
         ("uneven", "shared", "federated", "one"), ("uneven", "start", "base", "one"),
         ("lab", "pooled", "centralized", "five"), ("lab", "shared", "federated", "five"),
     )  # fmt: skip
-    found = results.repeat_partition_free(table)
+    found = tables.repeat_partition_free(table)
     pd.testing.assert_frame_equal(found[: len(table)], table)
     lent = found[len(table) :]
     assert set(zip(lent.partition, lent.arm, strict=True)) == {
@@ -94,7 +95,7 @@ def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_sever
     assert several.any() and not set(stored[several].recording) & set(stored[~several].recording)
     assert stored[~several].recording.nunique() == 1
     lab = stored[several & (stored.kind != "base")]
-    found = results.repeat_partition_free(pd.concat([stored[~several], lab]))
+    found = tables.repeat_partition_free(pd.concat([stored[~several], lab]))
     assert not ((found.partition == "lab") & (found.kind == "base")).any()
 
 
@@ -103,7 +104,7 @@ def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
     here = here[(here.partition != "iid") | (here.run == 0)]
     here.loc[here.partition == "lab", "arm"] = "alone"
     there = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "uneven"))).assign(run=5)
-    found = results.fill_in(here, there, "shared")
+    found = tables.fill_in(here, there, "shared")
     assert found.groupby("partition").run.unique().map(list).to_dict() == {"task": [0, 1], "iid": [5], "uneven": [5]}
 
 
@@ -140,20 +141,20 @@ def test_a_clients_own_task_is_the_one_that_partitions_deal_to_it():
     held = [{episodes[number]["task"] for number in part} for part in parts]
     assert [len(tasks) for tasks in held] == [1] * 10
     expected = [task in held[int(client)] for task, client in zip(alone.task, alone.client, strict=True)]
-    assert results.at_own_task(alone).tolist() == expected and sum(expected) == len(alone) / 3
-    assert not results.at_own_task(rows[rows.arm == "centralized"]).any()
-    assert not results.at_own_task(rows[rows.arm == "centralized"].drop(columns="client")).any()
+    assert tables.at_own_task(alone).tolist() == expected and sum(expected) == len(alone) / 3
+    assert not tables.at_own_task(rows[rows.arm == "centralized"]).any()
+    assert not tables.at_own_task(rows[rows.arm == "centralized"].drop(columns="client")).any()
 
 
 def test_arms_are_named_by_their_steps_and_those_alone_split_by_whose_task_it_was():
     rows = results.read_results(COMPARISON)
     rows = rows[(rows.partition == "task") & (rows.run == 0)]
-    named = results.by_steps(rows)
+    named = tables.by_steps(rows)
     assert len(named) == len(rows) and named.success.sum() == rows.success.sum()
     names = list(dict.fromkeys(named.arm))
     assert names[:3] == ["base, 0 steps", "local-only, own task, 80 steps", "local-only, other tasks, 80 steps"]
     assert {"centralized, 800 steps", "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(names)
-    own = rows[(rows.arm == "local-only") & results.at_own_task(rows)]
+    own = rows[(rows.arm == "local-only") & tables.at_own_task(rows)]
     assert named[named.arm == names[1]].success.mean() == own.success.mean()
 
 
@@ -161,8 +162,8 @@ def test_arms_are_named_by_their_steps_and_those_alone_split_by_whose_task_it_wa
 def test_labs_alone_are_held_against_the_federation_on_the_very_attempts_at_their_own_tasks(seeds):
     rows = results.read_results(COMPARISON)
     rows = rows[(rows.partition == "task") & (rows.run < seeds)]
-    found = results.beside_own_tasks(rows, "local-only", "fedavg-200x2x2", seed=0)
-    own = rows[(rows.arm == "local-only") & results.at_own_task(rows)]
+    found = tables.beside_own_tasks(rows, "local-only", "fedavg-200x2x2", seed=0)
+    own = rows[(rows.arm == "local-only") & tables.at_own_task(rows)]
     same = rows[rows.arm == "fedavg-200x2x2"].merge(own[["run", "task", "seed"]])
     assert found["seeds"] == seeds and found["n"] == len(own) == len(same) == 100 * seeds
     assert found["success_rate"] == own.success.mean() and found["other_rate"] == same.success.mean()

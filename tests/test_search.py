@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 import optuna
 import pytest
 
+from fedvla_book import tables
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import Config, from_profile
 from fedvla_lib.data import recordings, splits
@@ -28,7 +29,7 @@ def test_every_trial_has_the_same_budget(strategy):
         assert methods.total_steps(tried) == methods.total_steps(config)
         assert set(trial.params) == {"local_steps", "fraction_train", "lr"} | also
         assert all(getattr(tried, name) == value for name, value in trial.params.items())
-        assert set(trial.params) <= set(search.SEARCHED)
+        assert set(trial.params) <= set(tables.SEARCHED)
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     first = json.loads((out / "search.json").read_text())
     assert main([*command, "--trials", "2"]) == 0
     found = json.loads((out / "search.json").read_text())
-    assert search.compared(search.read_searches(tmp_path)).trials.to_list() == [2, 2]
+    assert tables.compared(tables.read_searches(tmp_path)).trials.to_list() == [2, 2]
     said = capsys.readouterr().out
     assert f"2 trials of {found['budget']} gradient steps" in said and "winner: " in said
     assert found["trials"][0] == first["trials"][0] and len(found["trials"]) == 2
@@ -124,9 +125,9 @@ def test_searches_are_read_by_strategy_and_compared_line_by_line(tmp_path):
     for number, found in enumerate(given):
         (tmp_path / str(number)).mkdir()
         (tmp_path / str(number) / "search.json").write_text(json.dumps(found))
-    searches = search.read_searches(tmp_path)
+    searches = tables.read_searches(tmp_path)
     assert searches == {found["config"]["strategy"]: found for found in given}
-    table = search.compared(searches).set_index(["strategy", "settings"])
+    table = tables.compared(searches).set_index(["strategy", "settings"])
     assert [name for name, _ in table.index[::2]] == ["fedavg", "fedprox", "fedadam"]  # as strategies are listed
     assert table.trials.to_list() == [1, 1, 2, 2, 3, 3] and table.diverged.to_list() == [0, 0, 1, 1, 0, 0]
     start, winner = (table.xs(which, level="settings") for which in ("start", "winner"))
@@ -145,9 +146,9 @@ def test_searches_are_read_by_strategy_and_compared_line_by_line(tmp_path):
 @pytest.mark.unit
 def test_no_search_and_two_of_one_strategy_are_refused(tmp_path):
     with pytest.raises(ValueError, match="has 0 searches"):
-        search.read_searches(tmp_path)
+        tables.read_searches(tmp_path)
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "search.json").write_text(json.dumps(found_by("fedavg", [0.1])))
     with pytest.raises(ValueError, match="has 2 searches of 1 strategies"):
-        search.read_searches(tmp_path)
+        tables.read_searches(tmp_path)

@@ -35,7 +35,7 @@ from papermill.exceptions import PapermillExecutionError
 
 import library
 import status
-from fedvla_book import plots
+from fedvla_book import plots, tables
 from fedvla_lib.evaluation import statistics
 from fedvla_lib.experiments import results
 
@@ -319,7 +319,7 @@ def _library_pages(root: Path, wanted: dict[Path, bytes], chapters: Iterable[Pat
         return {}
     trees, used = library.modules(root), library.used_in(chapters)
     _put(wanted, ARCHITECTURE, MODULES, lambda: library.table(root, used))
-    _put(wanted, FUNCTIONS_PAGE, FUNCTIONS, lambda: library.reference(trees))
+    _put(wanted, FUNCTIONS_PAGE, FUNCTIONS, lambda: library.reference(trees, library.rooms(root)))
     return {Path(IMPORTS): library.picture(library.imports(trees)).encode()}
 
 
@@ -361,7 +361,7 @@ def _headline(comparison: Path) -> str:
     Raises:
         BookError: federated and pooled training differ in their steps in all, so that the first sentence is wrong.
     """
-    rows = results.repeat_partition_free(results.read_results(comparison))
+    rows = tables.repeat_partition_free(results.read_results(comparison))
     of_task = rows[rows.partition == "task"]
     of_arm = results.summary(of_task).set_index("arm")
     labs, tasks = of_task.client.nunique(), of_task.task.nunique()
@@ -404,8 +404,8 @@ def _with_its_share(of_arm: pd.DataFrame) -> list[str]:
 def _with_steps_of_its_own(of_task: pd.DataFrame) -> list[str]:
     """Labs alone after as many steps as the federation, at their own task, and the federated model beside them."""
     longer = of_task[of_task.arm == LONGER]
-    steps, elsewhere = longer.steps_in_all.mean(), longer[~results.at_own_task(longer)]
-    found = results.beside_own_tasks(of_task, LONGER, FEDERATED, seed=0)
+    steps, elsewhere = longer.steps_in_all.mean(), longer[~tables.at_own_task(longer)]
+    found = tables.beside_own_tasks(of_task, LONGER, FEDERATED, seed=0)
     rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
     gap = _points(*(-100 * found[end] for end in ("difference", "high", "low")), " points")
     others = _percent(elsewhere.success.mean(), *statistics.success_interval(elsewhere))
@@ -445,9 +445,9 @@ def _outcome_figure(of_arm: pd.DataFrame) -> str:
 
 def _outcome(comparison: Path) -> bytes:
     """The figure under the front page's sentences, as PNG."""
-    rows = results.repeat_partition_free(results.read_results(comparison))
+    rows = tables.repeat_partition_free(results.read_results(comparison))
     plots.use_style()
-    axes = plots.success_intervals(results.summary(results.by_steps(rows[rows.partition == "task"])), ylabel="arm")
+    axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="arm")
     with tempfile.TemporaryDirectory() as folder:
         plots.save(axes, Path(folder) / "outcome.png")
         return (Path(folder) / "outcome.png").read_bytes()

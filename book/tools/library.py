@@ -13,14 +13,34 @@ import networkx
 from IPython.core.inputtransformer2 import TransformerManager
 
 PACKAGE = "fedvla_lib"
-ABOVE_ALL = {"cli", "doctor"}  # look at everything, from inside functions: their arrows would hide the others
-BOX, GAP, ROW, PAD = 112, 10, 64, 16  # of the picture, in pixels
+ROOT_FILES = "root"  # the room of the modules that stand in no package
+CHAR, LINE, PAD, GAP, WIDTH = 6.6, 18, 12, 34, 760  # of the picture, in pixels
 
 
 def modules(root: Path) -> dict[str, ast.Module]:
-    """Return the library's modules by name, parsed."""
-    files = sorted((root / PACKAGE).glob("*.py"))
-    return {file.stem: ast.parse(file.read_text(encoding="utf-8")) for file in files if file.stem != "__init__"}
+    """Return the library's modules by name, such as ``robot.sim``, parsed; packages are not among them.
+
+    Raises:
+        ValueError: there is none: whoever checks the modules must not pass on nothing.
+    """
+    folder = root / PACKAGE
+    files = [file for file in sorted(folder.rglob("*.py")) if not file.name.startswith("__")]
+    if not files:
+        raise ValueError(f"{folder} holds no module")
+    name = {file: ".".join(file.relative_to(folder).with_suffix("").parts) for file in files}
+    return {name[file]: ast.parse(file.read_text(encoding="utf-8")) for file in files}
+
+
+def rooms(root: Path) -> dict[str, str]:
+    """Return the library's packages, nested ones too, and what the docstring of each says."""
+    files = sorted((root / PACKAGE).rglob("*/__init__.py"))
+    name = {file: ".".join(file.parent.relative_to(root / PACKAGE).parts) for file in files}
+    return {name[file]: ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "" for file in files}
+
+
+def room_of(module: str) -> str:
+    """Return the outermost package of a module, or `ROOT_FILES`."""
+    return module.split(".")[0] if "." in module else ROOT_FILES
 
 
 def imports(trees: dict[str, ast.Module]) -> networkx.DiGraph:
@@ -28,9 +48,20 @@ def imports(trees: dict[str, ast.Module]) -> networkx.DiGraph:
     graph = networkx.DiGraph()
     graph.add_nodes_from(sorted(trees))
     for name, tree in trees.items():
-        used = {full.split(".")[1] for full in _names(tree).values() if full.count(".")}
-        graph.add_edges_from((name, other) for other in sorted(used & set(trees)))
+        used = set()
+        for full in _names(tree).values():
+            inside = full.removeprefix(f"{PACKAGE}.")
+            used |= {inside, inside.rpartition(".")[0]} & set(trees)
+        graph.add_edges_from((name, other) for other in sorted(used))
     return graph
+
+
+def between_rooms(graph: networkx.DiGraph) -> networkx.DiGraph:
+    """Return the graph of rooms: an arrow goes from a room to one of which it imports a module."""
+    found = networkx.DiGraph()
+    found.add_nodes_from(room_of(name) for name in graph)
+    found.add_edges_from((room_of(a), room_of(b)) for a, b in graph.edges if room_of(a) != room_of(b))
+    return found
 
 
 def _names(tree: ast.AST) -> dict[str, str]:
@@ -65,80 +96,101 @@ def _uses(trees: list[ast.Module]) -> Iterator[str]:
     yield from {f"{names[name]}.{attribute}" for name, attribute in through if name in names}
 
 
-def reference(trees: dict[str, ast.Module]) -> str:
-    """Return a section for each module that documents something, for Sphinx's autodoc to fill."""
-    parts = []
-    for name, tree in trees.items():
-        public = [node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
-        if any(not one.startswith("_") for one in public):
-            directive = f".. automodule:: {PACKAGE}.{name}\n   :members:\n"
-            parts.append(f"## {name}\n\n```{{eval-rst}}\n{directive}```\n")
+def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
+    """Return a section for each room and each of its modules that documents something, for Sphinx's autodoc to fill."""
+    parts, room = [], ""
+    for name in sorted(trees, key=lambda name: (room_of(name) != ROOT_FILES, name)):
+        public = [node.name for node in trees[name].body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        if not any(not one.startswith("_") for one in public):
+            continue
+        if (own := room_of(name)) != room:
+            room, told = own, _first_sentence(described.get(own, "What every room may use."))
+            parts.append(f"## {own}\n\n{told}\nIts place in the house: [](architecture.md#room-{own}).\n")
+        parts.append(f"### {name}\n\n```{{eval-rst}}\n.. automodule:: {PACKAGE}.{name}\n   :members:\n```\n")
     return "\n".join(parts)
 
 
 def table(root: Path, used: dict[str, list[str]]) -> str:
-    """Return the modules as a Markdown table: what each is for, and the first chapter that uses it."""
-    lines = ["| module | what it is for | first used in |", "|---|---|---|"]
-    for name, tree in modules(root).items():
-        said = " ".join((ast.get_docstring(tree) or "").split("\n\n")[0].split()).replace("|", "\\|")
-        full = f"{PACKAGE}.{name}"
-        chapters = sorted({one for key, found in used.items() if f"{key}.".startswith(f"{full}.") for one in found})
-        lines.append(f"| `{name}` | {said} | {f'[](../notebooks/{chapters[0]}.ipynb)' if chapters else ''} |")
-    return "\n".join(lines) + "\n"
+    """Return a section for each room: its paragraph, and its modules as a table with the first chapter that uses each.
+
+    Nested packages stand with the room that they are in.
+    """
+    trees, described = modules(root), rooms(root)
+    parts = []
+    for room in [ROOT_FILES, *(name for name in described if "." not in name)]:
+        words = described.get(room, "What every room may use.").replace("\n\n", "\n")
+        parts += [f"(room-{room})=", f"### {room}", "", words, ""]
+        parts += [described[inner].replace("\n\n", "\n") + "\n" for inner in described if inner.startswith(f"{room}.")]
+        parts += ["| module | what it is for | first used in |", "|---|---|---|"]
+        parts += [_row(name, tree, used) for name, tree in trees.items() if room_of(name) == room] + [""]
+    return "\n".join(parts)
+
+
+def _row(name: str, tree: ast.Module, used: dict[str, list[str]]) -> str:
+    full = f"{PACKAGE}.{name}"
+    chapters = sorted({one for key, found in used.items() if f"{key}.".startswith(f"{full}.") for one in found})
+    said = " ".join((ast.get_docstring(tree) or "").split("\n\n")[0].split()).replace("|", "\\|")
+    return f"| `{name}` | {said} | {f'[](../notebooks/{chapters[0]}.ipynb)' if chapters else ''} |"
+
+
+def _first_sentence(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split())
 
 
 def picture(graph: networkx.DiGraph) -> str:
-    """Return the imports as an SVG: what a module imports, directly or through others, stands above it.
+    """Return the rooms as an SVG, their modules in them: what a room imports stands above it.
 
     Only arrows that no longer path implies are drawn.
     """
-    shown = networkx.transitive_reduction(graph.subgraph(set(graph) - ABOVE_ALL))
-    rows = [sorted(row) for row in networkx.topological_generations(shown.reverse())]
-    rows = _untangled([part for row in rows for part in _parts(row)], shown)
-    width = max(map(len, rows)) * (BOX + GAP) - GAP + 2 * PAD
-    numbered = [(row, len(names), *one) for row, names in enumerate(rows) for one in enumerate(names)]
-    place = {name: _corner(row, column, columns, width) for row, columns, column, name in numbered}
-    arrows = [_arrow(place[above], place[below]) for below, above in sorted(shown.edges)]
-    boxes = [_box(name, *place[name]) for name in sorted(place)]
-    size = f'width="{width}" height="{len(rows) * ROW + PAD}" viewBox="0 0 {width} {len(rows) * ROW + PAD}"'
-    ground = '<rect width="100%" height="100%" fill="#fff"/>'
-    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n{ground}\n' + "\n".join([*arrows, *boxes]) + "\n</svg>\n"
-
-
-def _parts(row: list[str], most: int = 8) -> list[list[str]]:
-    return [row[start : start + most] for start in range(0, len(row), most)]
-
-
-def _untangled(rows: list[list[str]], graph: networkx.DiGraph) -> list[list[str]]:
-    """Order each row by the mean place of what its modules import, so that arrows cross less."""
-    place: dict[str, float] = {}
+    house = between_rooms(graph)
+    rows = [sorted(row) for row in networkx.topological_generations(house.reverse())]
+    inside = {room: [name for name in graph if room_of(name) == room] for room in house}
+    boxes, top = {}, PAD
     for row in rows:
-        mean = {name: _mean([place[above] for above in graph.successors(name)]) for name in row}
-        row.sort(key=lambda name, mean=mean: (mean[name], name))
-        place |= {name: (column + 0.5) / len(row) for column, name in enumerate(row)}
-    return rows
+        width = (WIDTH - (len(row) - 1) * GAP) / len(row)
+        lines = {room: _lines([name.removeprefix(f"{room}.") for name in inside[room]], width) for room in row}
+        height = max(map(len, lines.values())) * LINE + LINE + PAD
+        for column, room in enumerate(row):
+            boxes[room] = (PAD + column * (width + GAP), top, width, height, lines[room])
+        top += height + GAP
+    arrows = [_arrow(boxes[above], boxes[below]) for below, above in sorted(networkx.transitive_reduction(house).edges)]
+    size = f'width="{WIDTH + 2 * PAD}" height="{top}" viewBox="0 0 {WIDTH + 2 * PAD} {top}"'
+    ground = '<rect width="100%" height="100%" fill="#fff"/>'
+    drawn = [*arrows, *(_box(room, *box) for room, box in boxes.items())]
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n{ground}\n' + "\n".join(drawn) + "\n</svg>\n"
 
 
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values) if values else 0.5
+def _lines(names: list[str], width: float) -> list[str]:
+    """Names of modules, as many on a line as fit."""
+    lines = [""]
+    for name in names:
+        longer = f"{lines[-1]}   {name}".strip()
+        if len(longer) * CHAR > width - 2 * PAD and lines[-1]:
+            lines.append(name)
+        else:
+            lines[-1] = longer
+    return lines
 
 
-def _corner(row: int, column: int, columns: int, width: int) -> tuple[float, float]:
-    left = (width - columns * (BOX + GAP) + GAP) / 2
-    return left + column * (BOX + GAP), PAD + row * ROW
+Box = tuple[float, float, float, float, list[str]]
 
 
-def _arrow(above: tuple[float, float], below: tuple[float, float]) -> str:
-    start, end = (above[0] + BOX / 2, above[1] + 26), (below[0] + BOX / 2, below[1])
+def _arrow(above: Box, below: Box) -> str:
+    (x, y, width, height, _), (to_x, to_y, to_width, _, _) = above, below
+    start, end = (x + width / 2, y + height), (to_x + to_width / 2, to_y)
+    bend = min(GAP, (end[1] - start[1]) / 2)
     return (
-        f'<path d="M{start[0]:.0f},{start[1]:.0f} C{start[0]:.0f},{start[1] + 24:.0f} {end[0]:.0f},{end[1] - 24:.0f} '
-        f'{end[0]:.0f},{end[1]:.0f}" fill="none" stroke="#0072b2" stroke-opacity="0.45"/>'
+        f'<path d="M{start[0]:.0f},{start[1]:.0f} C{start[0]:.0f},{start[1] + bend:.0f} {end[0]:.0f},'
+        f'{end[1] - bend:.0f} {end[0]:.0f},{end[1]:.0f}" fill="none" stroke="#0072b2" stroke-width="2"/>'
     )
 
 
-def _box(name: str, x: float, y: float) -> str:
-    return (
-        f'<g><rect x="{x:.0f}" y="{y:.0f}" width="{BOX}" height="26" rx="4" fill="#f2f2f2" stroke="#444"/>'
-        f'<text x="{x + BOX / 2:.0f}" y="{y + 17:.0f}" text-anchor="middle" font-family="sans-serif" font-size="12">'
-        f"{escape(name)}</text></g>"
+def _box(room: str, x: float, y: float, width: float, height: float, lines: list[str]) -> str:
+    texts = [(room, 14, "bold"), *((line, 12, "normal") for line in lines)]
+    written = "".join(
+        f'<text x="{x + PAD:.0f}" y="{y + LINE * (row + 1):.0f}" font-family="sans-serif" font-size="{size}" '
+        f'font-weight="{weight}" xml:space="preserve">{escape(text)}</text>'
+        for row, (text, size, weight) in enumerate(texts)
     )
+    frame = f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}" rx="6" fill="#f2f2f2" stroke="#444"/>'
+    return f"<g>{frame}{written}</g>"

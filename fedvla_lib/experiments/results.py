@@ -4,9 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from scipy.stats import spearmanr
 
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
@@ -17,10 +15,8 @@ OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "tr
 OF_RUN = ("partition", "arm", "run")
 # Settings that decide what demonstrations there are and which of them are held out.
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
-BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
 SIDE_BY_SIDE = ("federated", "clients")  # kinds whose clients train at the same time
 ALONE = "local-only"  # the kind whose clients train for themselves
-OWN, OTHER = "own task", "other tasks"
 HELD_OUT = ("loss", "action_error")
 P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
@@ -82,36 +78,6 @@ def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
     return {"in_all": total, "in_a_row": in_a_row}
 
 
-def repeat_partition_free(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, and those of arms that see no partition once more for each partition of the same recording.
-
-    Base and centralized training come out the same however a recording is dealt out, so they are measured with one of
-    its partitions; to the others they are lent, for the same seeds and attempts. A partition that has an arm itself is
-    lent none of it, and no partition is lent anything of another recording, such as that of several laboratories.
-
-    Args:
-        rows: of `read_results`.
-    """
-    lent = []
-    for _, there in rows.groupby("recording", sort=False):
-        for _, measured in there[there.kind.isin(BLIND)].groupby("arm", sort=False):
-            lender = measured[measured.partition == measured.partition.iloc[0]]
-            lacking = [name for name in there.partition.unique() if name not in set(measured.partition)]
-            lent += [lender.assign(partition=name) for name in lacking]
-    return pd.concat([rows, *lent], ignore_index=True)
-
-
-def fill_in(rows: pd.DataFrame, other: pd.DataFrame, arm: str) -> pd.DataFrame:
-    """Return the partitions of `rows` in which `arm` has two training seeds or more, and those that only `other` has.
-
-    Args:
-        rows, other: of `read_results`, perhaps lent; partitions of one name are the same in both.
-    """
-    seeds = rows[rows.arm == arm].groupby("partition").run.nunique()
-    kept = rows[rows.partition.isin(seeds.index[seeds > 1])]
-    return pd.concat([kept, other[~other.partition.isin(kept.partition)]], ignore_index=True)
-
-
 def read_rounds(folder: Path) -> pd.DataFrame:
     """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
 
@@ -138,61 +104,6 @@ def read_rounds(folder: Path) -> pd.DataFrame:
     return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
 
 
-def correlations(rounds: pd.DataFrame, by: Sequence[str] = OF_RUN) -> pd.DataFrame:
-    """Return Spearman's correlation of held-out loss with success over the checkpoints of each group, and over all.
-
-    Columns partition, arm, run ("all" where the line does not tell them apart; everywhere in the last line), n
-    (checkpoints), rho: -1 if the loss ranks them as success does, NaN if all are alike or there is one only.
-
-    Args:
-        rounds: of `read_rounds`; what made no attempt is left out.
-        by: columns that make a group, of partition, arm and run.
-    """
-    measured = rounds.dropna(subset=["loss", "success_rate"])
-    groups = [(dict(zip(by, key, strict=True)), part) for key, part in measured.groupby(list(by), sort=False)]
-    return pd.DataFrame([
-        {**dict.fromkeys(OF_RUN, "all"), **group, "n": len(part), "rho": _spearman(part)}
-        for group, part in [*groups, ({}, measured)]
-    ])  # fmt: skip
-
-
-def _spearman(part: pd.DataFrame) -> float:
-    if min(part.loss.nunique(), part.success_rate.nunique()) < 2:
-        return float("nan")  # nothing to rank
-    return float(spearmanr(part.loss, part.success_rate).statistic)
-
-
-def clear_pairs(rounds: pd.DataFrame) -> pd.DataFrame:
-    """Return the pairs of checkpoints that differ in loss and whose intervals of success (Wilson's) are apart.
-
-    Columns partition, arm, run, round, loss, n, successes, success_rate, low, high of the one with the lower loss, the
-    same with `other_` in front of the other; gap: what lies between the intervals; misled: the lower loss succeeds
-    less often; same_run, and same_episodes: partition and training seed are the same, so the held-out episodes are.
-
-    Args:
-        rounds: of `read_rounds`; what made no attempt is left out.
-    """
-    table = rounds.dropna(subset=["loss", "success_rate"]).sort_values("loss", kind="stable", ignore_index=True)
-    ends = [statistics.wilson(int(k), int(n)) for k, n in zip(table.successes, table.n, strict=True)]
-    table["low"], table["high"] = np.array(ends, dtype=float).reshape(-1, 2).T
-    one, other = np.triu_indices(len(table), k=1)
-    low, high = table.low.to_numpy(), table.high.to_numpy()
-    gap = np.maximum(low[one] - high[other], low[other] - high[one])
-    kept = (gap > 0) & (table.loss.to_numpy()[one] < table.loss.to_numpy()[other])
-    of = [*OF_RUN, "round", "loss", "n", "successes", "success_rate", "low", "high"]
-    sides = [table.loc[places[kept], of].reset_index(drop=True) for places in (one, other)]
-    pairs = sides[0].join(sides[1].add_prefix("other_")).assign(gap=gap[kept])
-    shared = (pairs.partition == pairs.other_partition) & (pairs.run == pairs.other_run)
-    same_run = shared & (pairs.arm == pairs.other_arm)
-    return pairs.assign(misled=pairs.success_rate < pairs.other_success_rate, same_run=same_run, same_episodes=shared)
-
-
-def disagreements(rounds: pd.DataFrame) -> pd.DataFrame:
-    """Return those of `clear_pairs` whose lower loss succeeds less often, the widest gap first."""
-    pairs = clear_pairs(rounds)
-    return pairs[pairs.misled].sort_values("gap", ascending=False, kind="stable", ignore_index=True)
-
-
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
     """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
 
@@ -216,68 +127,6 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.
             "samples": cells.samples.mean(), "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
         })  # fmt: skip
     return pd.DataFrame(lines)
-
-
-def at_own_task(rows: pd.DataFrame) -> pd.Series:
-    """Return for each attempt whether it was at the task of the client that trained alone and made it.
-
-    Only with partition `task` has a client one task: client k number k of all in alphabetical order, in turn, as
-    `partition.partition` deals them out. Attempts of other arms, which no client made, are at nobody's own task.
-
-    Args:
-        rows: of `read_results`, of partition `task`, each arm with all tasks.
-    """
-    if "client" not in rows:
-        return pd.Series(False, rows.index)
-    tasks = sorted(rows.task.unique())
-    own = rows.client.map(lambda client: tasks[int(client) % len(tasks)], na_action="ignore")
-    return (rows.kind == ALONE) & (rows.task == own)
-
-
-def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with arms named by the gradient steps of a model of theirs, fewest first.
-
-    The attempts of clients that trained alone are split: those at their own task, and those at the others' tasks.
-
-    Args:
-        rows: of `read_results`, of partition `task`.
-    """
-    part = np.where(rows.kind == ALONE, np.where(at_own_task(rows), f", {OWN}", f", {OTHER}"), "")
-    taken = rows.groupby("arm")[["steps_in_all", "steps_in_a_row"]].transform("mean")
-    steps = [f", {_in_words(*each)}" for each in taken.itertuples(index=False)]
-    order = taken.assign(arm=rows.arm, part=part)
-    order = order.sort_values(list(order), ascending=[True, True, True, False], kind="stable")
-    return rows.assign(arm=rows.arm + part + steps).loc[order.index]
-
-
-def _in_words(in_all: float, in_a_row: float) -> str:
-    return f"{in_all:,.0f} steps" + (f", {in_a_row:,.0f} in a row" if in_a_row < in_all else "")
-
-
-def beside_own_tasks(rows: pd.DataFrame, arm: str, other: str, *, seed: int) -> dict[str, Any]:
-    """Hold clients that trained alone, at their own tasks, against another arm on the same attempts.
-
-    Args:
-        rows: of `read_results`, of partition `task`.
-        arm: whose clients trained alone.
-        other: an arm with the same attempts.
-        seed: of the interval's bootstrap.
-
-    Returns:
-        `compare.paired_difference` of arm - other where both have one training seed in common, else
-        `compare.difference_over_seeds`; also seeds, and for both arms success_rate and other_rate with low and high.
-    """
-    own = rows[(rows.arm == arm) & at_own_task(rows)]
-    key = ["run", "task", "seed"]
-    same = rows[rows.arm == other].merge(own[key], on=key)
-    own = own[own.run.isin(same.run)]
-    both, seeds = pd.concat([own, same], ignore_index=True), int(own.run.nunique())
-    of = statistics.paired_difference if seeds == 1 else statistics.difference_over_seeds
-    found = {"seeds": seeds, **of(both, arm, other, seed=seed)}
-    for name, part in (("success", own), ("other", same)):
-        low, high = statistics.success_interval(part)
-        found |= {f"{name}_rate": float(part.success.mean()), f"{name}_low": low, f"{name}_high": high}
-    return found
 
 
 def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:

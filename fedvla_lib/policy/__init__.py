@@ -1,5 +1,5 @@
-"""SmolVLA: build or load it, choose what trains, train it, and let it act.
+"""SmolVLA: build or load a policy, select the parameters to train, train it, and run it on observations.
 
-May import `data` and `robot`, torch and LeRobot's policies. Knows no federation: a client and a pooled training call
-the same `training.local_train`. Start reading with `model`, then `training`.
+May import `data`, `robot`, torch and LeRobot's policies. Does not know the federation: a client and centralized
+training call the same `training.local_train`. Start reading with `model`, then `training`.
 """

@@ -1,4 +1,4 @@
-"""Lets a policy drive the arm: predict a chunk of actions, carry out part of it, look again."""
+"""Run a policy in closed loop on observations: predict a chunk of actions, execute part of it, observe again."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY, Observation, image_key
 
 
 class PolicyActor:
-    """Lets a policy drive the arm: look once, carry out `n_action_steps` of the predicted chunk, look again.
+    """Controls the arm with a policy; executes `n_action_steps` of each predicted chunk before it observes again.
 
-    The flow-matching noise comes from (`seed`, episode seed), so an evaluation can be repeated exactly.
+    The flow-matching noise is seeded by (`seed`, episode seed), so rollouts are reproducible.
     """
 
     def __init__(self, bundle: Bundle, seed: int = 0) -> None:
@@ -22,7 +22,7 @@ class PolicyActor:
         self.seed = seed
 
     def reset(self, env: Any, seed: int) -> None:
-        """Forget the last episode and read the instruction of this one."""
+        """Start an episode: drop queued actions, read the instruction, seed the noise."""
         self._queue: deque[np.ndarray] = deque()
         self._instruction = env.instruction
         mixed = np.random.SeedSequence([self.seed, seed]).generate_state(1, np.uint64)[0]
@@ -34,13 +34,13 @@ class PolicyActor:
 
     @staticmethod
     def act_together(actors: Sequence["PolicyActor"], observations: Sequence[Observation]) -> list[np.ndarray]:
-        """Return the next joint targets of several actors with one policy; those that must look, look at once."""
-        looking = [(actor, seen) for actor, seen in zip(actors, observations, strict=True) if not actor._queue]
-        if looking:
-            bundle = looking[0][0].bundle
-            batch = _joined([_as_batch(seen, actor._instruction) for actor, seen in looking])
-            noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in looking])
-            for (actor, _), chunk in zip(looking, _denoise(bundle, batch, noise), strict=True):
+        """Return the next joint targets of several actors with one policy; new chunks are predicted in one batch."""
+        due = [(actor, observed) for actor, observed in zip(actors, observations, strict=True) if not actor._queue]
+        if due:
+            bundle = due[0][0].bundle
+            batch = _joined([_as_batch(observed, actor._instruction) for actor, observed in due])
+            noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in due])
+            for (actor, _), chunk in zip(due, _denoise(bundle, batch, noise), strict=True):
                 actor._queue.extend(chunk[: bundle.policy.config.n_action_steps].numpy())
         return [actor._queue.popleft() for actor in actors]
 
@@ -63,13 +63,13 @@ def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torc
 
 
 def _joined(batches: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Raw batches of one, as one raw batch."""
+    """Concatenate raw batches."""
     tensors = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0] if key != "task"}
     return tensors | {"task": [text for batch in batches for text in batch["task"]]}
 
 
 def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
-    """Turn one Gymnasium observation into a raw batch of one."""
+    """Convert a Gymnasium observation to a raw batch of size 1."""
     batch: dict[str, Any] = {"task": [instruction]}
     for camera, pixels in observation["pixels"].items():
         image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]  # (1, 3, H, W)

@@ -1,4 +1,4 @@
-"""The shapes of SmolVLA at full size, without its weights: what would travel, counted where nothing can be downloaded.
+"""Shapes of the full-size SmolVLA without its weights, to compute what a client would send without a download.
 
 Sizes are those of SmolVLM2-500M-Video-Instruct, whose first 16 text layers SmolVLA uses (Shukor et al. 2025,
 https://arxiv.org/abs/2506.01844, and the public configurations of both models).
@@ -30,10 +30,10 @@ VISION = {
 
 
 def meta_policy() -> SmolVLAPolicy:
-    """Return LeRobot's policy with every tensor in its place and no memory behind it (PyTorch's meta device)."""
+    """Return LeRobot's full-size policy on PyTorch's meta device, which allocates no memory."""
     settings = SmolVLAConfig(load_vlm_weights=False, device="cpu")
-    picture = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
-    settings.input_features = {image_key(camera): picture for camera in CAMERAS}
+    image = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
+    settings.input_features = {image_key(camera): image for camera in CAMERAS}
     settings.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))
     settings.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
     with tempfile.TemporaryDirectory() as scratch, torch.device("meta"):
@@ -43,12 +43,12 @@ def meta_policy() -> SmolVLAPolicy:
 
 
 def exchanged_shapes(policy: SmolVLAPolicy) -> Shapes:
-    """Return the names and shapes of what trains."""
+    """Return the shapes of the trainable parameters by name."""
     return shapes_of(trainable(policy))
 
 
 def _backbone(folder: Path) -> Path:
-    """The nano backbone's folder with the sizes of the large one; the tokenizer decides no shape."""
+    """Write the nano backbone with the sizes of the large one; the tokenizer does not affect shapes."""
     write_nano(folder, 64)
     config = json.loads((folder / "config.json").read_text())
     config["text_config"] |= TEXT

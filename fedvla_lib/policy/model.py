@@ -1,8 +1,8 @@
-"""Build or load a SmolVLA policy, choose what trains, and let it drive the arm.
+"""Build or load a SmolVLA policy, select its trainable parameters, and save it.
 
-Whatever `Config.base` names, the result is LeRobot's own `SmolVLAPolicy` with LeRobot's own processors: the pretrained
-nano model that comes with this package (`pretrain` made it), the same with random weights, a local `pretrained_model`
-folder, or a hub id such as ``lerobot/smolvla_base``.
+The result is always LeRobot's own `SmolVLAPolicy` with LeRobot's processors. `Config.base` names the weights: the
+pretrained nano model of this package (made by `pretraining.pretrain`), the same architecture with random weights, a
+local `pretrained_model` folder, or a hub id such as ``lerobot/smolvla_base``.
 """
 
 import contextlib
@@ -28,38 +28,38 @@ from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano,
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
 
-POSITION_STD = 0.3  # spread of the nano vision encoder's initial position embeddings
-VLM_FOLDER = "vlm"  # a saved nano policy carries its backbone's config and tokenizer, so the folder can be moved
+POSITION_STD = 0.3  # standard deviation of the nano vision encoder's initial position embeddings
+VLM_FOLDER = "vlm"  # a saved nano policy includes its backbone's config and tokenizer, so the folder can be moved
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A policy with the processors that turn raw batches into its inputs and its outputs into joint targets."""
+    """A policy with its processors, from raw batches to inputs and from outputs to joint targets."""
 
     policy: SmolVLAPolicy
     preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
     postprocess: Any  # normalised actions -> degrees and gripper 0-100
-    own: Arrays = field(default_factory=dict)  # what is personal, as it was when the policy was loaded
+    own: Arrays = field(default_factory=dict)  # personal parameters, as they were when the policy was loaded
 
     def shared(self) -> dict[str, torch.nn.Parameter]:
-        """Return the live parameters that train and belong to everybody, by name."""
+        """Return the trainable parameters that are not personal, by name (the live ones, not copies)."""
         return {name: p for name, p in trainable(self.policy).items() if name not in self.own}
 
     def shared_arrays(self) -> Arrays:
-        """Return copies of what travels, float32, by name."""
+        """Return copies of the parameters that are exchanged, float32, by name."""
         return {name: array for name, array in trainable_arrays(self.policy).items() if name not in self.own}
 
 
 def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
-    """Return the policy that `config.base` names, frozen as `config` says, in evaluation mode.
+    """Return the policy `config.base` in evaluation mode, with parameters frozen according to `config`.
 
     Args:
-        stats: normalisation statistics of state and action. None takes those saved with the base.
+        stats: normalisation statistics of state and action. None: use those saved with the base.
 
     Raises:
-        ValueError: the base cannot be found or lacks weights, or no statistics are known.
+        ValueError: the base cannot be found or lacks weights, or there are no statistics.
     """
-    torch.set_num_threads(granted_threads(config))  # sums in another order differ in their last bits
+    torch.set_num_threads(granted_threads(config))  # the order of sums, and so their last bits, depends on it
     if stats is None and config.base == NANO_RANDOM:
         raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
     source = str(nano_base()) if config.base == NANO else config.base
@@ -72,22 +72,22 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
 
 
 def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
-    """The arrays of the parts that stay with a client.
+    """The arrays of the parts that stay on a client.
 
     Raises:
-        ValueError: a part that nothing trainable belongs to, or nothing is left to share.
+        ValueError: a part has no trainable parameter, or all parts are personal.
     """
     arrays = trainable_arrays(policy) if parts else {}
-    known = sorted({layer_of(name) for name in arrays})
-    if unknown := [part for part in parts if part not in known]:
-        raise ValueError(f"personal={unknown[0]!r} is not a part that trains: choose from {', '.join(known)}")
-    if parts and set(parts) == set(known):
-        raise ValueError(f"personal={', '.join(parts)!r} leaves nothing to share: leave out one of {', '.join(known)}")
+    valid = sorted({layer_of(name) for name in arrays})
+    if unknown := [part for part in parts if part not in valid]:
+        raise ValueError(f"personal={unknown[0]!r} is not a trainable part: choose from {', '.join(valid)}")
+    if parts and set(parts) == set(valid):
+        raise ValueError(f"personal={', '.join(parts)!r} leaves nothing to share: remove one of {', '.join(valid)}")
     return {name: array for name, array in arrays.items() if layer_of(name) in parts}
 
 
 def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
-    """Return one row per part of the model: module, parameters, trainable parameters and the reader's name for it."""
+    """Return one row per part of the model: module, its plain name, parameters and trainable parameters."""
     rows = []
     for prefix, meaning in MODULES.items():
         named = [p for name, p in policy.named_parameters() if name.startswith(prefix)]
@@ -111,10 +111,10 @@ MODULES = {
 
 
 def save_policy(bundle: Bundle, folder: Path) -> None:
-    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, adapters merged in.
+    """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, with adapters merged.
 
     Raises:
-        FileExistsError: `folder` is there already; nothing is overwritten.
+        FileExistsError: `folder` exists; nothing is overwritten.
         OSError: it cannot be written; the message names it.
     """
     folder = Path(folder)
@@ -125,7 +125,7 @@ def save_policy(bundle: Bundle, folder: Path) -> None:
 
 
 def write_policy(bundle: Bundle, folder: Path) -> None:
-    """Write the files of a ``pretrained_model`` folder into `folder`, which somebody else publishes."""
+    """Write the files of a ``pretrained_model`` folder into `folder`, an existing draft."""
     for part in (merged(bundle.policy), bundle.preprocess, bundle.postprocess):
         part.save_pretrained(folder)
     backbone = Path(bundle.policy.config.vlm_model_name)
@@ -134,18 +134,18 @@ def write_policy(bundle: Bundle, folder: Path) -> None:
 
 
 def _random_nano(config: Config) -> SmolVLAPolicy:
-    """Random weights that depend on the seed alone, whatever was drawn before."""
+    """A nano policy with random weights that depend on the seed only."""
     settings = SmolVLAConfig(
         vlm_model_name=str(ensure_nano(cache_dir(), config.image_size)),
         num_vlm_layers=0,  # 0 keeps all layers the backbone has
         resize_imgs_with_padding=(config.image_size, config.image_size),
-        device=config.device,  # left out, LeRobot looks for an accelerator and logs two warnings
+        device=config.device,  # otherwise LeRobot looks for an accelerator and logs two warnings
     )
     _adapt(settings, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         policy = SmolVLAPolicy(settings)
-        # The default (0.02) drowns where a patch lies in what it shows; at this scale the model learns to locate.
+        # At the default (0.02) a patch's position is lost against its content; with this the model learns to locate.
         torch.nn.init.normal_(_vision_positions(policy), std=POSITION_STD)
     return policy.to(config.device)
 
@@ -160,10 +160,10 @@ def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
         if not isinstance(settings, SmolVLAConfig):
             raise ValueError(f"base={base!r} is a {settings.type!r} policy: give a smolvla one")
         _adapt(settings, config)
-        settings.load_vlm_weights = False  # the policy's own file holds them, fine-tuned
+        settings.load_vlm_weights = False  # the policy's own file has them, fine-tuned
         if (Path(base) / VLM_FOLDER).is_dir():
             settings.vlm_model_name = str((Path(base) / VLM_FOLDER).resolve())
-        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line per load
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line for each load
             policy = SmolVLAPolicy.from_pretrained(base, config=settings)
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
         raise ValueError(_not_found(config.base, error)) from error
@@ -180,28 +180,25 @@ def _not_found(base: str, error: Exception) -> str:
 
 
 def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:
-    """LeRobot only logs missing tensors; a policy that is partly random must not pass for a pretrained one."""
+    """Raise ValueError for missing tensors, which LeRobot only logs and leaves random."""
     file = Path(base) / WEIGHTS_FILE
     if not file.is_file():
-        return  # from the hub cache: the file's place is LeRobot's business
+        return  # from the hub cache, whose layout only LeRobot knows
     with safe_open(file, "pt") as weights:
         missing = sorted(set(policy.state_dict()) - set(weights.keys()))
     if missing:
-        raise ValueError(f"{file} lacks {len(missing)} tensors of the policy, {missing[0]!r} first")
+        raise ValueError(f"{file} lacks {len(missing)} tensors of the policy, the first is {missing[0]!r}")
 
 
 def _adapt(settings: SmolVLAConfig, config: Config) -> None:
-    """Set what a run decides: cameras and sizes, chunk, device, and what is frozen."""
+    """Set cameras, sizes, chunk, device and frozen parts from the run's settings."""
     shape = (3, config.image_size, config.image_size)
     settings.input_features = {image_key(camera): PolicyFeature(FeatureType.VISUAL, shape) for camera in CAMERAS}
     settings.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))
     settings.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
-    settings.chunk_size = config.chunk_size
-    settings.n_action_steps = config.n_action_steps
-    settings.freeze_vision_encoder = config.freeze_vision_encoder
-    settings.train_expert_only = config.train_expert_only
-    settings.train_state_proj = config.train_state_proj
-    settings.device = config.device
+    same = ("chunk_size", "n_action_steps", "freeze_vision_encoder", "train_expert_only", "train_state_proj", "device")
+    for name in same:
+        setattr(settings, name, getattr(config, name))
 
 
 def _processors(policy: SmolVLAPolicy, stats: Stats | None, base: str) -> tuple[Any, Any]:
@@ -215,7 +212,7 @@ def _processors(policy: SmolVLAPolicy, stats: Stats | None, base: str) -> tuple[
 
 
 def _as_tensors(stats: Stats) -> dict[str, dict[str, torch.Tensor]]:
-    """A missing key would silently skip normalisation in LeRobot, so its absence is an error here."""
+    """Statistics as tensors; a missing key is an error, since LeRobot would silently skip normalisation."""
     for key in (STATE_KEY, ACTION_KEY):
         if not {"mean", "std"} <= set(stats.get(key, ())):
             raise ValueError(f"statistics lack mean and std of {key!r}: got {sorted(stats)}")

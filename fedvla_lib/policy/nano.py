@@ -1,8 +1,7 @@
-"""The nano vision-language backbone: a folder that LeRobot's unchanged `SmolVLAPolicy` accepts as `vlm_model_name`.
+"""The nano vision-language backbone: a folder that LeRobot's unmodified `SmolVLAPolicy` accepts as `vlm_model_name`.
 
 It has the parts of SmolVLM2 (SigLIP-style vision tower, pixel-shuffle connector, Llama-style text model, BPE tokenizer
-with SmolVLM's special tokens) at a width of 128. Its weights are random: it is an architecture to learn with, not a
-language model.
+with SmolVLM's special tokens) at width 128, with random weights. Also finds the pretrained nano base of this package.
 """
 
 import hashlib
@@ -19,25 +18,18 @@ from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoPro
 from fedvla_lib.files import new_folder
 
 PACKAGE = "fedvla-lib"
-NANO, NANO_RANDOM = "nano", "nano-random"  # names of a base
+NANO, NANO_RANDOM = "nano", "nano-random"  # values of Config.base
 WEIGHTS_FILE = "model.safetensors"
 WIDTH = 128
 TEXT_LAYERS = 4
 VISION_LAYERS = 3
-PATCHES_PER_SIDE = 8  # the patch size follows the image size, so compute does not
-CONNECTOR_SCALE = 2  # pixel shuffle folds 2 x 2 patches into one token: 16 tokens per camera
+PATCHES_PER_SIDE = 8  # the patch size scales with the image size, so compute is constant
+CONNECTOR_SCALE = 2  # pixel shuffle merges 2 x 2 patches into one token: 16 tokens per camera
 VOCAB_SIZE = 384
 SPECIAL_TOKENS = [
-    "<|im_start|>",
-    "<|im_end|>",
-    "<fake_token_around_image>",
-    "<image>",
-    "<global-img>",
-    "<end_of_utterance>",
-]
-
-
-# The tokenizer learns its merges from these words; bytes it never saw still encode, only less compactly.
+    "<|im_start|>", "<|im_end|>", "<fake_token_around_image>", "<image>", "<global-img>", "<end_of_utterance>",
+]  # fmt: skip
+# The tokenizer learns its merges from these sentences; other bytes can still be encoded, but take more tokens.
 CORPUS = [
     f"{verb} the {color} {thing}."
     for verb in ("Lift", "Put", "Push", "Pick up", "Move", "Stack", "Sort", "Slide", "Place")
@@ -47,7 +39,7 @@ CORPUS = [
 
 
 def ensure_nano(cache: Path, image_size: int) -> Path:
-    """Return the folder of the nano backbone for `image_size` pixels under `cache`, writing it when it is not there.
+    """Return the folder under `cache` of the nano backbone for `image_size` pixels; write it if it does not exist.
 
     Raises:
         ValueError: `image_size` is not a multiple of the number of patches per side.
@@ -76,25 +68,14 @@ def write_nano(folder: Path, image_size: int) -> None:
 
 def _config(image_size: int, tokenizer: PreTrainedTokenizerFast) -> SmolVLMConfig:
     vision = {
-        "hidden_size": WIDTH,
-        "intermediate_size": 2 * WIDTH,
-        "num_hidden_layers": VISION_LAYERS,
-        "num_attention_heads": 4,
-        "image_size": image_size,
-        "patch_size": image_size // PATCHES_PER_SIDE,
-    }
+        "hidden_size": WIDTH, "intermediate_size": 2 * WIDTH, "num_hidden_layers": VISION_LAYERS,
+        "num_attention_heads": 4, "image_size": image_size, "patch_size": image_size // PATCHES_PER_SIDE,
+    }  # fmt: skip
     text = {
-        "model_type": "llama",
-        "hidden_size": WIDTH,
-        "intermediate_size": 2 * WIDTH,
-        "num_hidden_layers": TEXT_LAYERS,
-        "num_attention_heads": 4,
-        "num_key_value_heads": 2,
-        "head_dim": WIDTH // 4,
-        "vocab_size": len(tokenizer),
-        "max_position_embeddings": 512,
-        "pad_token_id": tokenizer.pad_token_id,
-    }
+        "model_type": "llama", "hidden_size": WIDTH, "intermediate_size": 2 * WIDTH, "num_hidden_layers": TEXT_LAYERS,
+        "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": WIDTH // 4, "vocab_size": len(tokenizer),
+        "max_position_embeddings": 512, "pad_token_id": tokenizer.pad_token_id,
+    }  # fmt: skip
     return SmolVLMConfig(
         vision_config=vision,
         text_config=text,
@@ -132,33 +113,32 @@ def _tokenizer() -> PreTrainedTokenizerFast:
 def nano_base() -> Path:
     """Return the folder of the pretrained nano model.
 
-    Flower's app bundle takes no weights, so a library that runs from a bundle looks where the package is installed.
+    Flower's app bundle contains no weights; code running from a bundle finds them in the installed package.
 
     Raises:
-        ValueError: it is in neither place.
+        ValueError: the weights are in neither place.
     """
-    places = [Path(__file__).parents[1], *_installed()]
-    for place in places:
-        if (place / "nano_base" / WEIGHTS_FILE).is_file():
-            return place / "nano_base"
+    for package in (Path(__file__).parents[1], *_installed()):
+        if (package / "nano_base" / WEIGHTS_FILE).is_file():
+            return package / "nano_base"
     raise ValueError(
-        f"base={NANO!r} is not here and the package fedvla-lib is not installed: install it on every machine of the "
+        f"base={NANO!r} was not found and the package {PACKAGE} is not installed: install it on every machine of the "
         "federation, or give another base"
     )
 
 
 def _installed() -> list[Path]:
-    """Where the installed package's modules may be: in site-packages, or in the folder of an editable installation."""
+    """Possible folders of the installed package: in site-packages, or the checkout of an editable installation."""
     try:
         package = distribution(PACKAGE)
     except PackageNotFoundError:
         return []
     source = json.loads(package.read_text("direct_url.json") or "{}").get("url", "")
-    places = [Path(str(package.locate_file("fedvla_lib")))]
-    return places + ([Path(url2pathname(urlsplit(source).path)) / "fedvla_lib"] if source.startswith("file:") else [])
+    folders = [Path(str(package.locate_file("fedvla_lib")))]
+    return folders + ([Path(url2pathname(urlsplit(source).path)) / "fedvla_lib"] if source.startswith("file:") else [])
 
 
 def base_digest(base: str) -> str:
-    """Return a short hash of the weights that a base names, or its name where the weights are not a local file."""
+    """Return a short hash of a base's weights, or its name if they are not in a local folder."""
     file = (nano_base() if base == NANO else Path(base)) / WEIGHTS_FILE
     return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else base

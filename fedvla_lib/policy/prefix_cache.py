@@ -1,9 +1,9 @@
-"""Compute once what a frozen vision-language model says about a frame, and train the action expert on that.
+"""Cache the prefix of each frame under a frozen vision-language model, and train the action expert on the cache.
 
-SmolVLA's prefix (images, instruction, state) never attends to the actions behind it. While everything that makes the
-prefix is frozen and images are not augmented, its keys and values are constants of a frame: they are computed once with
-the policy's own methods, kept in a memory-mapped file, and each training step runs the expert alone. The loss and its
-gradients equal `SmolVLAPolicy.forward`'s.
+SmolVLA's prefix (images, instruction, state) does not attend to the actions that follow it. If everything that makes
+the prefix is frozen and images are not augmented, its keys and values are constant for a frame: they are computed once
+with the policy's own methods and stored in a memory-mapped file, and a gradient step runs the expert only. The loss and
+its gradients equal those of `SmolVLAPolicy.forward`.
 """
 
 import hashlib
@@ -26,52 +26,51 @@ from fedvla_lib.files import cache_dir, new_folder
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY
 
-PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and which positions are real
+PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and their padding mask
 BATCH = 64  # frames per forward pass while filling the store
 
 
 @dataclass(frozen=True)
 class PrefixStore:
-    """Keys and values of every frame of a data set under one frozen model."""
+    """Keys and values of all frames of a data set under one frozen model."""
 
     cache: np.ndarray  # float32 (N, layers, 2, kv heads, prefix length, head dim): keys, then values
-    real: np.ndarray  # bool (N, prefix length): False where the instruction was padded
+    real: np.ndarray  # bool (N, prefix length): False where the instruction is padded
 
     def rows(self, rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return keys and values, and the mask, of the frames `rows`."""
+        """Return keys and values, and the mask, of frames `rows`."""
         return torch.from_numpy(self.cache[rows]), torch.from_numpy(self.real[rows])
 
 
 class PrefixBatches:
-    """Training batches that carry the stored prefix instead of images: the same rows in the same order."""
+    """The same training batches with stored prefixes in place of images."""
 
     def __init__(self, batches: Batches, prefixes: PrefixStore) -> None:
         self._batches, self._prefixes = batches, prefixes
         self.seed, self.num_examples = batches.seed, batches.num_examples
 
     def at(self, step: int) -> dict[str, Any]:
-        """Return the batch of a step: targets in degrees, padding mask, task, and the prefix."""
+        """Return the batch of a gradient step: targets in degrees, padding mask, task and prefix."""
         rows = self._batches.rows_at(step)
-        return targets_of_rows(self._batches.store, rows, self._batches.chunk_size) | {
-            PREFIX_KEY: self._prefixes.rows(rows)
-        }
+        targets = targets_of_rows(self._batches.store, rows, self._batches.chunk_size)
+        return targets | {PREFIX_KEY: self._prefixes.rows(rows)}
 
 
 def with_cached_prefixes(bundle: Bundle, batches: Batches, progress: bool = False) -> Batches | PrefixBatches:
-    """Return the same training batches with stored prefixes where these are constant, else `batches` itself."""
+    """Return the same training batches with stored prefixes if prefixes are constant, else `batches` itself."""
     if batches.augment or not is_constant(bundle.policy):
         return batches
     return PrefixBatches(batches, ensure_prefixes(bundle, batches.store, cache_dir() / "prefixes", progress))
 
 
 def is_constant(policy: SmolVLAPolicy) -> bool:
-    """Tell whether training leaves the prefix of a frame as it is."""
+    """Return whether training leaves prefixes unchanged."""
     settings = policy.config
     return settings.freeze_vision_encoder and settings.train_expert_only and not settings.train_state_proj
 
 
 def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
-    """Flow-matching loss of a batch with stored prefix: mean of (v - (noise - action))^2 over real action entries.
+    """Return the flow-matching loss of a batch with stored prefix: mean of (v - (noise - action))^2 over real actions.
 
     Args:
         noise: float32 (B, chunk, max_action_dim), x_1 of the flow.
@@ -89,7 +88,7 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
 
 
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
-    """Return the prefixes of every frame of `store`, computing them into `folder` unless this model's are there."""
+    """Return the prefixes of all frames of `store` under this model, computing them into `folder` if needed."""
     target = folder / f"prefix-{_fingerprint(bundle, store)}"
     if not target.is_dir():
         _fill(bundle, store, target, progress)
@@ -114,11 +113,11 @@ def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> No
 
 
 def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Run images, instruction and state through the vision-language model, with gradients unless they are off.
+    """Run images, instruction and state through the vision-language model; gradients flow if enabled.
 
     Returns:
-        keys and values, (B, layers, 2, kv heads, L, head dim), and which positions are real, bool (B, L); instructions
-        are padded to at least `length` tokens.
+        keys and values, (B, layers, 2, kv heads, L, head dim), and the mask of real positions, bool (B, L);
+        instructions are padded to at least `length` tokens.
     """
     policy = bundle.policy
     inputs = bundle.preprocess({key: value for key, value in batch.items() if key != ACTION_KEY})
@@ -146,13 +145,13 @@ def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
 
 
 def _longest(bundle: Bundle, store: FrameStore) -> int:
-    """Tokens of the longest instruction in the data set."""
+    """Number of tokens of the longest instruction in the data set."""
     first = store.episodes.drop_duplicates("instruction").start.to_numpy()
     return bundle.preprocess(batch_of_rows(store, first, bundle.policy.config.chunk_size))[OBS_LANGUAGE_TOKENS].shape[1]
 
 
 def _fingerprint(bundle: Bundle, store: FrameStore) -> str:
-    """Everything the prefix depends on: frozen weights, statistics, and the data set's identity."""
+    """Hash of everything that prefixes depend on: frozen weights, statistics and the data set."""
     frozen = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if not p.requires_grad}
     digest = hashlib.sha256(save(frozen))
     for step in bundle.preprocess.steps:

@@ -1,4 +1,4 @@
-"""How the nano base was made: rendered scenes teach it what words mean, then demonstrations teach it to act.
+"""Pretraining of the nano base: phrase grounding on rendered scenes, then imitation of demonstrations.
 
-May import `evaluation` and what that may import; nothing of the federation. Start reading with `pretrain`.
+May import `evaluation` and what that may import; does not know the federation. Start reading with `pretrain`.
 """
