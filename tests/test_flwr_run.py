@@ -46,13 +46,13 @@ def tiny(recording, tmp_path):
 
 
 def forget(message, context, call_next):
-    """Around a handler: a client that keeps nothing from one message to the next."""
+    """A mod for a client that keeps no state between messages."""
     context.state = RecordDict()
     return call_next(message, context)
 
 
 def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
-    """Two rounds with everything that a client keeps from one to the next: control variate, optimiser, remainder."""
+    """Two rounds with all state that a client keeps between rounds: control variate, optimiser state, rounding error."""
     tiny = replace(tiny, num_server_rounds=2, strategy="scaffold", keep_optimizer=True, exchange="int8")
     before = PYPROJECT.read_bytes()
     root = simulation.run_simulation(tiny, timeout_s=540)
@@ -75,7 +75,7 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     )
     assert left.keys() == right.keys()
     assert max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
-    assert max(np.abs(left[name] - other[name]).max() for name in left) > 1e-4  # workers that forgot would end there
+    assert max(np.abs(left[name] - other[name]).max() for name in left) > 1e-4  # what workers without state would give
     ledgers = [run_folder.read_metrics(one, "replies").query("to == 'train'") for one in (root, inline)]
     columns = ["round", "good", "sent_bytes", "received_bytes"]
     np.testing.assert_allclose(*(ledger[columns].astype(float) for ledger in ledgers), rtol=1e-4)
@@ -104,10 +104,10 @@ def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path)
 
 @pytest.mark.unit
 def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
-    """As from a wheel: the package's folder and nothing beside it."""
+    """As from a wheel: only the folder of the package."""
     package = PYPROJECT.parent / "fedvla_lib"
     alone = shutil.copytree(package, tmp_path / "site/fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
-    code = "import sys; from fedvla_lib import superlink; print(superlink.stage_app(superlink.Path(sys.argv[1])))"
+    code = "import pathlib, sys; from fedvla_lib.engines import app_bundle as a; print(a.stage_app(pathlib.Path(sys.argv[1])))"
     environment = {**os.environ, "PYTHONPATH": str(alone.parent)}
     command = [sys.executable, "-c", code, str(tmp_path / "stage")]
     said = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout

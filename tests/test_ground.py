@@ -76,7 +76,7 @@ def test_things_are_marked_in_their_cells():
     shares = np.full((1, 1, 2, 2), np.nan)
     shares[0, 0, 1] = (0.8, 0.3)  # right, upper half
     np.testing.assert_array_equal(grounding.in_cells(shares, 2)[0], [[0, 0], [0, 1], [0, 0], [0, 0]])
-    assert not grounding.in_cells(shares + 0.25, 2).any()  # now outside the picture
+    assert not grounding.in_cells(shares + 0.25, 2).any()  # now outside the image
 
 
 def test_the_tokens_of_a_phrase_spell_it(scenes, bundle):

@@ -1,4 +1,4 @@
-"""The nano base: made again by one command, none of the clients' tasks in it, and the one in the package is whole."""
+"""The nano base: reproducible by one command, trained on none of the clients' tasks, complete in the package."""
 
 import json
 import re
@@ -48,7 +48,7 @@ def test_the_account_says_how_the_base_was_made_and_what_it_can_do(made):
 
 def test_the_same_recipe_gives_the_same_bits_after_an_interruption(made, tmp_path, monkeypatch):
     monkeypatch.setattr(pretrain, "measure", lambda *_: [])  # measured above
-    monkeypatch.setattr(pretrain, "obeys", lambda *_: [])
+    monkeypatch.setattr(pretrain, "follows_instructions", lambda *_: [])
     checkpoints = pretrain._work_folder(SMALL) / "checkpoints"
 
     shutil.rmtree(checkpoints / "step_000004")  # a training killed after step 2
@@ -74,7 +74,7 @@ def test_a_base_can_be_moved_and_names_no_place_of_the_machine_that_made_it(made
         moved.rename(made)
 
 
-# --- the one that comes with the package
+# --- the base in the package
 
 
 def test_the_base_in_the_package_is_small_whole_and_has_its_account():
@@ -90,7 +90,7 @@ def test_the_base_in_the_package_is_small_whole_and_has_its_account():
     assert "base" in PROFILES["gpu"]
 
 
-def test_two_cubes_and_the_wrong_colour_are_what_the_misled_arm_hears():
+def test_two_cubes_and_the_wrong_colour_are_what_the_misled_actor_gets():
     bundle = model.load_policy(from_profile("laptop", num_threads=1))
     (seed,) = pretrain._seeds_with_two_cubes("grip", 1)
     env = So100Env("grip", image_size=64)
@@ -110,9 +110,9 @@ def test_pretraining_draws_every_wording():
 
 
 def test_a_bundle_without_weights_finds_the_installed_package(tmp_path, monkeypatch):
-    """Flower's bundle takes .py files only, so the library in it lies beside no weights."""
-    monkeypatch.setattr(model, "__file__", str(tmp_path / "fedvla_lib" / "model.py"))
+    """Flower's app bundle contains .py files only, so there are no weights next to its library."""
+    monkeypatch.setattr(nano, "__file__", str(tmp_path / "fedvla_lib" / "policy" / "nano.py"))
     assert (nano.nano_base() / nano.WEIGHTS_FILE).is_file()
-    monkeypatch.setattr(model, "PACKAGE", "fedvla-lib-that-is-not-installed")
+    monkeypatch.setattr(nano, "PACKAGE", "fedvla-lib-that-is-not-installed")
     with pytest.raises(ValueError, match="install it on every machine"):
         nano.nano_base()

@@ -73,7 +73,7 @@ class Questions:
             **{image_key(camera): image for camera, image in images.items()},
             STATE_KEY: torch.zeros(len(rows), NUM_JOINTS),  # unused: words do not attend to the later state
             "task": texts,
-            NAMED: torch.tensor(named),  # (phrase tokens, 3): row, token, obj
+            NAMED: torch.tensor(named),  # (phrase tokens, 3): row, token, object
             PRESENT: torch.from_numpy(in_cells(self.scenes.shares[rows], self._cells)),  # (B, image tokens, objects)
             PLACES: torch.from_numpy(places.astype(np.float32)),  # (B, objects, 2)
         }
@@ -85,7 +85,7 @@ class Questions:
         return vision.vision_config.image_size // vision.vision_config.patch_size // vision.scale_factor
 
     def _tokens(self, text: str, phrases: list[tuple[int, int, int]]) -> Iterator[tuple[int, int]]:
-        """Yield (obj, index of the token in the instruction) for each token of each phrase."""
+        """Yield (object, index of the token in the instruction) for each token of each phrase."""
         tokenizer = self.bundle.policy.model.vlm_with_expert.processor.tokenizer
         pieces = tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
         for obj, start, end in phrases:
@@ -93,7 +93,7 @@ class Questions:
 
 
 def sentence(present: np.ndarray, rng: np.random.Generator) -> tuple[str, list[tuple[int, int, int]]]:
-    """Return a sentence that names some of the objects `present`, and (obj, start, end) of each phrase in it."""
+    """Return a sentence that names some of the objects `present`, and (object, start, end) of each phrase in it."""
     count = int(rng.integers(1, min(MOST_NAMED, len(present)) + 1))
     text, phrases = OPENINGS[rng.integers(len(OPENINGS))], []
     for place, obj in enumerate(rng.permutation(present)[:count]):
@@ -104,7 +104,7 @@ def sentence(present: np.ndarray, rng: np.random.Generator) -> tuple[str, list[t
 
 
 def in_cells(shares: np.ndarray, side: int) -> np.ndarray:
-    """Return which objects are in which cells: shares (B, cameras, objects, 2) -> (B, cameras * side * side, objects)."""
+    """Return which objects are in which cells: (B, cameras, objects, 2) -> float32 (B, cameras * side², objects)."""
     seen = ((shares >= 0) & (shares < 1)).all(axis=-1)  # False for NaN: not in the scene
     columns, rows = np.moveaxis(np.floor(np.nan_to_num(shares) * side).astype(int), -1, 0)
     marks = np.zeros((*seen.shape[:2], side * side, seen.shape[2]), np.float32)
