@@ -53,12 +53,12 @@ def test_the_base_is_trained_and_acts(tmp_path):
 
 def test_every_client_is_compared_with_the_federation(tmp_path):
     arguments = ["--seeds", "0", "--rollouts", "1", "--threads", "1"]  # another worker of the tests has the other core
-    found = {row["arm"]: row for row in run("four_arms", tmp_path, *arguments)}
+    found = {row["method"]: row for row in run("four_methods", tmp_path, *arguments)}
     tasks, clients = 3, from_profile("tiny").num_clients
-    assert found["federated"]["attempts"] == tasks and found["all clients alone"]["attempts"] == tasks * clients
-    (kept,) = (tmp_path / "four_arms").glob("*.json")
+    assert found["federated"]["rollouts"] == tasks and found["all clients alone"]["rollouts"] == tasks * clients
+    (kept,) = (tmp_path / "four_methods").glob("*.json")
     before = kept.stat().st_mtime_ns
-    assert {row["arm"]: row for row in run("four_arms", tmp_path, *arguments)} == found
+    assert {row["method"]: row for row in run("four_methods", tmp_path, *arguments)} == found
     assert kept.stat().st_mtime_ns == before  # not measured again
 
 

@@ -242,7 +242,7 @@ def test_the_front_page_shows_the_first_film_of_the_last_round(tmp_path):
 @pytest.mark.unit
 def test_the_front_page_says_what_the_stored_comparison_found():
     stored = results.read_results(ROOT / build_book.COMPARISON)
-    rows = stored[(stored.partition == "task") & (stored.arm == "fedavg-200x2x2")]
+    rows = stored[(stored.partition == "task") & (stored.method == "fedavg-200x2x2")]
     said = build_book._headline(ROOT / build_book.COMPARISON)
     assert f"the federated model succeeds in {100 * rows.success.mean():.1f} % [" in said
     assert f"{len(rows):,} rollouts over {rows.run.nunique()} training seeds" in said
@@ -262,12 +262,12 @@ def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_judg
     stored = results.read_results(ROOT / build_book.COMPARISON)
     stored = stored[stored.partition == "task"]
     said = build_book._headline(ROOT / build_book.COMPARISON)
-    share, longer = (stored[stored.arm == arm] for arm in ("local-only", "local-only-800"))
-    steps = {arm: part.steps_in_all.unique().item() for arm, part in (("share", share), ("longer", longer))}
+    share, longer = (stored[stored.method == method] for method in ("local-only", "local-only-800"))
+    steps = {method: part.steps_in_all.unique().item() for method, part in (("share", share), ("longer", longer))}
     assert f"only its share of the steps, {steps['share']}, succeeds in {100 * share.success.mean():.1f} % [" in said
     assert "no measure of what a lab can do alone" in said and "is not answered by this grid" in said
     own = longer[tables.at_own_task(longer)]
-    federated = stored[(stored.arm == "fedavg-200x2x2") & stored.run.isin(own.run)]
+    federated = stored[(stored.method == "fedavg-200x2x2") & stored.run.isin(own.run)]
     same = federated.merge(own[["run", "task", "seed"]], on=["run", "task", "seed"])
     assert len(same) == len(own) and own.counted.all()
     assert f"After {steps['longer']} steps each, labs alone succeed in {100 * own.success.mean():.1f} % [" in said
@@ -279,7 +279,7 @@ def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_judg
 
 
 @pytest.mark.unit
-def test_the_front_page_draws_each_arm_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
+def test_the_front_page_draws_each_method_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
     drawn = []
     draw = build_book.plots.success_intervals
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
@@ -293,10 +293,10 @@ def test_the_front_page_draws_each_arm_with_its_steps_and_labs_alone_by_whose_ta
 
 
 @pytest.mark.unit
-def test_the_front_page_is_not_built_over_arms_that_took_other_steps(monkeypatch):
+def test_the_front_page_is_not_built_over_methods_that_took_other_steps(monkeypatch):
     read = results.read_results
     longer = lambda folder: (rows := read(folder)).assign(  # noqa: E731
-        steps_in_all=rows.steps_in_all.where(rows.arm != "centralized", rows.steps_in_all + 1)
+        steps_in_all=rows.steps_in_all.where(rows.method != "centralized", rows.steps_in_all + 1)
     )
     monkeypatch.setattr(build_book.results, "read_results", longer)
     with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in steps"):

@@ -13,11 +13,11 @@ from fedvla_lib.evaluation import statistics
 pytestmark = pytest.mark.unit
 
 
-def rows(**arms):
+def rows(**methods):
     return pd.DataFrame(
         [
-            {"arm": arm, "task": "lift", "seed": seed, "success": bool(ok)}
-            for arm, outcomes in arms.items()
+            {"method": method, "task": "lift", "seed": seed, "success": bool(ok)}
+            for method, outcomes in methods.items()
             for seed, ok in enumerate(outcomes)
         ]
     )
@@ -60,7 +60,7 @@ def test_wilson_covers_the_truth_as_often_as_it_says(n, lowest):
 
 
 def test_success_table_counts_per_group():
-    table = statistics.success_table(rows(a=[1, 1, 0, 0], b=[1, 1, 1, 1]), by=["arm"])
+    table = statistics.success_table(rows(a=[1, 1, 0, 0], b=[1, 1, 1, 1]), by=["method"])
     assert list(table.success_rate) == [0.5, 1.0]
     assert list(table.n) == [4, 4]
     assert (table.low <= table.success_rate).all() and (table.success_rate <= table.high).all()
@@ -71,7 +71,7 @@ def test_mcnemar_equals_the_exact_binomial():
     result = statistics.paired_difference(rows(a=left, b=right), "a", "b", seed=0)
     tail = sum(comb(12, k) for k in range(4)) / 2**12
     assert result["p_value"] == pytest.approx(2 * tail)
-    assert (result["only_arm"], result["only_other"], result["n"]) == (9, 3, 17)
+    assert (result["only_method"], result["only_other"], result["n"]) == (9, 3, 17)
     assert result["difference"] == pytest.approx(6 / 17)
 
 
@@ -111,13 +111,13 @@ def test_the_interval_of_a_loss_or_of_its_difference_covers_the_truth(draw, trut
     assert least <= covered <= (0.97 if least >= 0.93 else 0.93)
 
 
-def test_equal_arms_show_no_difference():
+def test_equal_methods_show_no_difference():
     result = statistics.paired_difference(rows(a=[1, 0, 1], b=[1, 0, 1]), "a", "b", seed=0)
     assert (result["difference"], result["low"], result["high"], result["p_value"]) == (0, 0, 0, 1)
 
 
 def test_unpaired_rollouts_are_refused():
-    with pytest.raises(ValueError, match="unknown arm 'c': choose one of a, b"):
+    with pytest.raises(ValueError, match="unknown method 'c': choose one of a, b"):
         statistics.paired(rows(a=[1], b=[1]), "a", "c")
     with pytest.raises(ValueError, match="did not run the same rollouts"):
         statistics.paired(rows(a=[1, 0], b=[1]), "a", "b")
@@ -177,13 +177,13 @@ def test_the_paired_interval_covers_a_known_difference(n, discordant, truth):
 
 
 def outcomes(values, tasks=2):
-    """A line for each training seed, a column for each attempt, half of them at each task."""
+    """A line for each training seed, a column for each rollout, half of them at each task."""
     values = np.asarray(values, float)
     columns = [(f"task {k * tasks // values.shape[1]}", k) for k in range(values.shape[1])]
     return pd.DataFrame(values, columns=pd.MultiIndex.from_tuples(columns, names=["task", "seed"]))
 
 
-def test_with_one_attempt_a_seed_the_interval_is_students():
+def test_with_one_rollout_a_seed_the_interval_is_students():
     each = np.array([0.1, 0.4, 0.3, 0.25, 0.6])
     found = statistics.over_seeds(outcomes(each[:, None], tasks=1))
     expected = stats.ttest_1samp(each, 0)
@@ -192,34 +192,34 @@ def test_with_one_attempt_a_seed_the_interval_is_students():
 
 
 def test_the_parts_of_the_variance_are_those_of_a_case_worked_out_by_hand():
-    # Four seeds, two attempts at one task: seeds are off the mean by 0.5, 0.5, 0 and 0, attempts by 0.
+    # Four seeds, two rollouts at one task: seeds are off the mean by 0.5, 0.5, 0 and 0, rollouts by 0.
     found = statistics.over_seeds(outcomes([[1, 1], [0, 0], [1, 0], [0, 1]], tasks=1))
-    # Sums of squares: seeds 2 (0.25 + 0.25), attempts 0, rest 4 x 0.25. Mean squares: 1/3, 0, 1/3.
-    # Their sum MS_seeds + MS_attempts - MS_rest is 0, so half the rest counts, with the seeds' degrees of freedom.
+    # Sums of squares: seeds 2 (0.25 + 0.25), rollouts 0, rest 4 x 0.25. Mean squares: 1/3, 0, 1/3.
+    # Their sum MS_seeds + MS_rollouts - MS_rest is 0, so half the rest counts, with the seeds' degrees of freedom.
     reach = stats.t.ppf(0.975, 3) * sqrt(1 / 6 / 8)
     assert (found["low"], found["high"]) == pytest.approx((0.5 - reach, 0.5 + reach))
 
 
-def test_several_attempts_need_several_training_seeds():
+def test_several_rollouts_need_several_training_seeds():
     with pytest.raises(ValueError, match="at least 2"):
         statistics.over_seeds(outcomes([[1, 0, 1, 1]]))
 
 
 @pytest.mark.parametrize(
-    ("of_seeds", "of_attempts", "bootstrap"),
+    ("of_seeds", "of_rollouts", "bootstrap"),
     [(0, 0, (0.98, 1)), (0, 1, (0.98, 1)), (0.1, 0.5, (0.97, 1)), (0.3, 0.5, (0.88, 0.95))],
 )
-def test_intervals_over_seeds_and_attempts_cover_the_truth_as_often_as_they_say(of_seeds, of_attempts, bootstrap):
-    """Two arms of known success: 5 training seeds x 2 tasks x 50 attempts, simulated 800 times.
+def test_intervals_over_seeds_and_rollouts_cover_the_truth_as_often_as_they_say(of_seeds, of_rollouts, bootstrap):
+    """Two methods of known success: 5 training seeds x 2 tasks x 50 rollouts, simulated 800 times.
 
-    The difference and the rate of one arm keep their word; the bootstrap of so few seeds does not, and says so.
+    The difference and the rate of one method keep their word; the bootstrap of so few seeds does not, and says so.
     """
     rng, seeds, easy = np.random.default_rng(7), 5, np.repeat([1.0, 0.3], 50)
-    spread = sqrt(1 + of_seeds**2 + of_attempts**2)
+    spread = sqrt(1 + of_seeds**2 + of_rollouts**2)
     rates = [stats.norm.cdf((np.array([1.0, 0.3]) - shift) / spread).mean() for shift in (0.0, 0.3)]
     columns, covered = outcomes(np.zeros((1, 100))).columns, {"difference": [], "rate": [], "bootstrap": []}
     for k in range(800):
-        shared = of_attempts * rng.normal(size=100)  # an attempt that is hard is hard for both arms
+        shared = of_rollouts * rng.normal(size=100)  # an rollout that is hard is hard for both methods
         left, right = (
             easy - shift + shared + of_seeds * rng.normal(size=(seeds, 1)) + rng.normal(size=(seeds, 100)) > 0
             for shift in (0.0, 0.3)
@@ -237,11 +237,11 @@ def test_intervals_over_seeds_and_attempts_cover_the_truth_as_often_as_they_say(
     assert bootstrap[0] <= share["bootstrap"] <= bootstrap[1]
 
 
-def test_arms_are_paired_by_training_seed_and_attempt():
-    arms = {"a": [[1, 1, 1, 0], [1, 1, 0, 1]], "b": [[1, 0, 1, 0], [0, 1, 0, 1]]}
+def test_methods_are_paired_by_training_seed_and_rollout():
+    methods = {"a": [[1, 1, 1, 0], [1, 1, 0, 1]], "b": [[1, 0, 1, 0], [0, 1, 0, 1]]}
     lines = [
-        {"arm": arm, "run": run, "task": "lift", "seed": seed, "success": ok}
-        for arm, each in arms.items() for run, outcome in enumerate(each) for seed, ok in enumerate(outcome)
+        {"method": method, "run": run, "task": "lift", "seed": seed, "success": ok}
+        for method, each in methods.items() for run, outcome in enumerate(each) for seed, ok in enumerate(outcome)
     ]  # fmt: skip
     table = pd.DataFrame(lines)
     found = statistics.difference_over_seeds(table, "a", "b", seed=0)
@@ -250,8 +250,8 @@ def test_arms_are_paired_by_training_seed_and_attempt():
     assert found["boot_low"] <= 0.25 <= found["boot_high"]
     with pytest.raises(ValueError, match="cannot be paired"):
         statistics.difference_over_seeds(table.drop(index=[3, 7]), "a", "b", seed=0)
-    with pytest.raises(ValueError, match="lack attempts"):
-        statistics.by_run(table[table.arm == "a"].drop(index=3))
+    with pytest.raises(ValueError, match="lack rollouts"):
+        statistics.by_run(table[table.method == "a"].drop(index=3))
     with pytest.raises(ValueError, match="twice"):
         statistics.by_run(table)
 
@@ -263,18 +263,18 @@ def test_the_crossed_bootstrap_is_as_wide_as_the_spread_of_seeds_when_only_they_
     assert (low, high) == pytest.approx(tuple(np.quantile(draws, [0.025, 0.975])), abs=0.021)
 
 
-def test_the_order_in_which_attempts_were_made_does_not_matter():
+def test_the_order_in_which_rollouts_were_made_does_not_matter():
     rng = np.random.default_rng(0)
-    rows = [{"arm": arm, "run": run, "task": "lift", "seed": seed, "success": rng.random() < 0.5}
-            for arm in "ab" for run in (0, 1, 2) for seed in range(12)]  # fmt: skip
+    rows = [{"method": method, "run": run, "task": "lift", "seed": seed, "success": rng.random() < 0.5}
+            for method in "ab" for run in (0, 1, 2) for seed in range(12)]  # fmt: skip
     table = pd.DataFrame(rows)
-    dealt_out = pd.concat([table[table.arm == "a"], table[table.arm == "b"].sort_values("seed", ascending=False)])
+    dealt_out = pd.concat([table[table.method == "a"], table[table.method == "b"].sort_values("seed", ascending=False)])
     there, here = (statistics.difference_over_seeds(of, "a", "b", seed=0) for of in (table, dealt_out))
     assert there == here
 
 
 @pytest.mark.parametrize("ending", [False, True])
-def test_attempts_that_all_end_alike_leave_room_for_doubt(ending):
+def test_rollouts_that_all_end_alike_leave_room_for_doubt(ending):
     rows = [{"run": run, "task": "lift", "seed": seed, "success": ending} for run in (0, 1) for seed in range(30)]
     low, high = statistics.success_interval(pd.DataFrame(rows))
     assert (low, high) == pytest.approx(statistics.wilson(30 * ending, 30)) and high - low > 0.05

@@ -1,4 +1,4 @@
-"""`fedvla compare` on real runs: the same attempts and episodes line up, and what cannot be compared is refused."""
+"""`fedvla compare` on real runs: the same rollouts and episodes line up, and what cannot be compared is refused."""
 
 import json
 import shutil
@@ -44,7 +44,7 @@ def copied(run, out, *, settings=None, kind="", name="", change=lambda value: va
     return out
 
 
-def test_runs_are_compared_attempt_by_attempt_and_episode_by_episode(runs, tmp_path, capsys):
+def test_runs_are_compared_rollout_by_rollout_and_episode_by_episode(runs, tmp_path, capsys):
     names = ["fedavg", "median"]
     assert main(["compare", *(str(runs[name]) for name in names), "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
@@ -141,12 +141,12 @@ def test_what_cannot_be_compared_is_refused_by_name_and_labelled_if_asked_for(ru
     assert set(values[values.mismatch == what].metric) == concerned
 
 
-def test_runs_without_a_common_attempt_leave_nothing_to_compare(runs, tmp_path, capsys):
+def test_runs_without_a_common_rollout_leave_nothing_to_compare(runs, tmp_path, capsys):
     theirs = copied(runs["median"], tmp_path / "other", kind="rollout", name="seed", change=lambda seed: seed + 1000)
     arguments = ["compare", str(runs["fedavg"]), str(theirs), "--metrics", "success_rate", "--allow-mismatch"]
     assert main(arguments) == 2
     said = capsys.readouterr().err
-    assert "other and fedavg share no attempt" in said and len(said.splitlines()) == 1
+    assert "other and fedavg share no rollout" in said and len(said.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -41,16 +41,16 @@ partition = "modulo"
 [partitions.by_task]
 partition = "task"
 
-[arms.averaged]
+[methods.averaged]
 
-[arms.pooled]
+[methods.pooled]
 kind = "centralized"
 
 [[only]]
 partition = "mixed"
 
 [[only]]
-arm = "averaged"
+method = "averaged"
 seed = 0
 """
 
@@ -77,15 +77,15 @@ def test_cells_come_seed_by_seed_and_only_those_wanted(file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("[arms.pooled]", "[arms.pooled"), "line"),
+        (("[methods.pooled]", "[methods.pooled"), "line"),
         (("rollouts = 2", ""), "lacks 'rollouts'"),
-        (("rollouts = 2", "rollouts = 2\nattempts = 3"), "'attempts'"),
+        (("rollouts = 2", "rollouts = 2\nattempts = 3"), "'rollouts'"),
         (('kind = "centralized"', 'kind = "central"'), "'central'.*local-only"),
         (("num_clients = 2", "clients = 2"), "'clients'"),
         (("seeds = [0, 1]", "seeds = 3"), "seeds=3.*list of whole numbers"),
         (("rollouts = 2", "rollouts = 'two'"), "rollouts='two'.*above 0"),
-        (('arm = "averaged"', 'strategy = "averaged"'), "'strategy' under.*arm"),
-        (("[arms.pooled]", "[arms.'../pooled']"), "'../pooled'"),
+        (('method = "averaged"', 'strategy = "averaged"'), "'strategy' under.*method"),
+        (("[methods.pooled]", "[methods.'../pooled']"), "'../pooled'"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_with_the_remedy(file, change, message, capsys):
@@ -99,11 +99,11 @@ def test_a_file_that_cannot_be_used_is_named_with_the_remedy(file, change, messa
 
 
 def printed_table(said, column):
-    """The printed table that has a column of this name, by arm."""
+    """The printed table that has a column of this name, by method."""
     lines = said.splitlines()
     start = next(number for number, line in enumerate(lines) if column in line.split())
     names, rows = lines[start].split(), [line.split() for line in lines[start + 1 :]]
-    table = pd.DataFrame([row for row in rows if len(row) == len(names)], columns=names).set_index("arm")
+    table = pd.DataFrame([row for row in rows if len(row) == len(names)], columns=names).set_index("method")
     return table.drop(columns="partition").astype(float)
 
 
@@ -113,8 +113,8 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     settings = {**grid["settings"], "tasks": "lift,push", "data": str(recording)}
     lines = ["profile = 'tiny'", "seeds = [0]", "rollouts = 2", "[settings]"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
-    lines += ["[partitions.mixed]", "[arms.start]", "kind = 'base'", "[arms.averaged]", "[arms.pooled]",
-              "kind = 'centralized'", "[arms.alone]", "kind = 'local-only'", "[arms.each]", "kind = 'clients'",
+    lines += ["[partitions.mixed]", "[methods.start]", "kind = 'base'", "[methods.averaged]", "[methods.pooled]",
+              "kind = 'centralized'", "[methods.alone]", "kind = 'local-only'", "[methods.each]", "kind = 'clients'",
               "personal = 'projections'"]  # fmt: skip
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
@@ -127,25 +127,25 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     assert all((out / name / "stamp.json").stat().st_mtime_ns == time for name, time in before.items())
 
     rows = results.read_results(out)
-    each, rows = rows[rows.arm == "each"], rows[rows.arm != "each"]
-    assert set(rows.arm) == {"start", "averaged", "pooled", "alone"} and len(rows) == 4 * 2 * 2
-    assert len(each) == 2 * 2 and each.loss.notna().all()  # of every client its own attempts
-    pairs = rows.groupby("arm")[["task", "seed"]].apply(lambda part: sorted(map(tuple, part.values)))
-    assert all(pair == pairs.iloc[0] for pair in pairs)  # every arm made the same attempts
-    steps = rows.groupby("arm").gradient_steps.first()
+    each, rows = rows[rows.method == "each"], rows[rows.method != "each"]
+    assert set(rows.method) == {"start", "averaged", "pooled", "alone"} and len(rows) == 4 * 2 * 2
+    assert len(each) == 2 * 2 and each.loss.notna().all()  # of every client its own rollouts
+    pairs = rows.groupby("method")[["task", "seed"]].apply(lambda part: sorted(map(tuple, part.values)))
+    assert all(pair == pairs.iloc[0] for pair in pairs)  # every method made the same rollouts
+    steps = rows.groupby("method").gradient_steps.first()
     assert steps["start"] == 0 and steps["averaged"] == steps["pooled"] == steps["alone"] == 4
-    models = {arm: run_folder.read_stamp(out / f"mixed_{arm}_0")["steps"] for arm in steps.index}
+    models = {method: run_folder.read_stamp(out / f"mixed_{method}_0")["steps"] for method in steps.index}
     assert models == {
         "start": {"global": {"in_all": 0, "in_a_row": 0}}, "averaged": {"global": {"in_all": 4, "in_a_row": 2}},
         "pooled": {"global": {"in_all": 4, "in_a_row": 4}},
         "alone": {f"client_{k}": {"in_all": 2, "in_a_row": 2} for k in (0, 1)},
     }  # fmt: skip
     assert rows.counted.all() and (each.steps_in_all == 4).all()
-    of_model = rows.groupby("arm")[["steps_in_all", "steps_in_a_row"]].agg(["min", "max"])
+    of_model = rows.groupby("method")[["steps_in_all", "steps_in_a_row"]].agg(["min", "max"])
     assert of_model.loc["alone"].tolist() == [2, 2, 2, 2] and of_model.loc["averaged"].tolist() == [4, 4, 2, 2]
-    travelled = rows.groupby("arm").bytes.first()
+    travelled = rows.groupby("method").bytes.first()
     assert travelled["averaged"] > 1e6 and travelled["pooled"] == travelled["start"] == 0
-    assert rows.groupby("arm").loss.first().nunique() == 4
+    assert rows.groupby("method").loss.first().nunique() == 4
     said = said.replace("True", "1")
     spent = printed_table(said, "gradient_steps")  # what is equal, and what is not, stands in the table at the end
     learned = ["averaged", "pooled", "alone"]
@@ -158,7 +158,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     pooled = run_folder.read_stamp(out / "mixed_pooled_0")
     assert 0 < pooled["train_s"] < 0.95 * pooled["wall_s"]  # what measures a model is no part of its training
     alone = run_folder.read_metrics(out / "mixed_alone_0", "rollout")
-    assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the attempts are dealt out over the clients
+    assert set(alone.client) == {0, 1} and len(alone) == 2 * 2  # the rollouts are dealt out over the clients
     with pytest.raises(ValueError, match="no results"):
         results.read_results(tmp_path / "nowhere")
 
@@ -181,11 +181,11 @@ def test_a_cell_whose_clients_failed_is_stamped_with_the_steps_that_were_taken(r
 
 @pytest.mark.unit
 @pytest.mark.parametrize("file", sorted({*REFERENCE.glob("*.toml")} - {REFERENCE / "notes.toml"}), ids=lambda f: f.stem)
-def test_attempts_start_where_no_demonstration_and_no_look_during_training_did(file):
+def test_rollouts_start_where_no_demonstration_and_no_look_during_training_did(file):
     plan = read_plan(file)
     config = plan.cells[0].config
     episodes = range(config.episodes_per_task * len(task_names(config)))
-    shown = {demonstration_seed(0, index, attempt) for index in episodes for attempt in range(MAX_ATTEMPTS)}
+    shown = {demonstration_seed(0, index, rollout) for index in episodes for rollout in range(MAX_ATTEMPTS)}
     during_training = range(FIRST_SEED, FIRST_SEED + CLIENT_SEEDS * (config.num_clients + 1))
     assert not set(plan.rollout_seeds) & (shown | set(during_training))
 
@@ -207,15 +207,15 @@ def handed_out(monkeypatch):
 
 @pytest.mark.integration
 @pytest.mark.parametrize("partition", ["task", "lab"])
-def test_no_arm_trains_on_a_held_out_episode_and_all_make_the_same_new_attempts(partition, handed_out):
-    """What training was handed, for each kind of arm; the recording is the one of tests/test_labs.py."""
+def test_no_method_trains_on_a_held_out_episode_and_all_make_the_same_new_rollouts(partition, handed_out):
+    """What training was handed, for each kind of method; the recording is the one of tests/test_labs.py."""
     settings = {"tasks": "lift,push", "num_labs": 3, "episodes_per_task": 6, "num_clients": 2, "num_server_rounds": 1}
     config = experiment.with_recording(from_profile("tiny", **QUIET, **settings, partition=partition))
     store, seeds = recordings.open_frames(config), [2_000_000, 2_000_001]
     held_out, shares = splits.held_out_episodes(store, config), splits.shares(store, config)
     own = sorted(sorted(share.train_ids) for share in shares)
     whole = sorted(store.episodes.episode_id[~store.episodes.episode_id.isin(held_out)])
-    shown = {demonstration_seed(0, i, attempt) for i in range(len(store.episodes)) for attempt in range(MAX_ATTEMPTS)}
+    shown = {demonstration_seed(0, i, rollout) for i in range(len(store.episodes)) for rollout in range(MAX_ATTEMPTS)}
     for kind, expected in {"federated": own, "local-only": own, "centralized": [whole]}.items():
         handed_out.clear()
         found = experiment.MEASURES[kind](config, seeds)
@@ -223,16 +223,16 @@ def test_no_arm_trains_on_a_held_out_episode_and_all_make_the_same_new_attempts(
         assert trained == expected, kind
         assert not {episode for part in trained for episode in part} & set(held_out), kind
         assert sorted(row["episode_id"] for row in found.episodes) == sorted(held_out) and held_out, kind
-        attempts = sorted((row["task"], row["seed"]) for row in found.rows)
-        assert attempts == [(task, seed) for task in ("lift", "push") for seed in seeds], kind
-        assert not {seed for _, seed in attempts} & shown, kind
+        rollouts = sorted((row["task"], row["seed"]) for row in found.rows)
+        assert rollouts == [(task, seed) for task in ("lift", "push") for seed in seeds], kind
+        assert not {seed for _, seed in rollouts} & shown, kind
 
 
 @pytest.mark.integration
 def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tmp_path, capsys):
     lines = ["profile = 'tiny'", "seeds = [0]", "rollouts = 2", "[settings]", f"data = {json.dumps(str(recording))}",
-             "tasks = 'lift,push'", "num_clients = 2", "[partitions.mixed]", "[arms.averaged]", "eval_every = 1",
-             "eval_rollouts = 1", "[arms.pooled]", "kind = 'centralized'"]  # fmt: skip
+             "tasks = 'lift,push'", "num_clients = 2", "[partitions.mixed]", "[methods.averaged]", "eval_every = 1",
+             "eval_rollouts = 1", "[methods.pooled]", "kind = 'centralized'"]  # fmt: skip
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
     assert main(["experiment", str(file), "--out", str(out)]) == 0
@@ -260,13 +260,13 @@ def test_a_wrong_choice_of_statistics_changes_the_model_or_how_it_acts(choice, r
 
 
 @pytest.mark.unit
-def test_differences_use_the_seeds_that_both_arms_have_and_are_corrected_together():
+def test_differences_use_the_seeds_that_both_methods_have_and_are_corrected_together():
     rng = np.random.default_rng(0)
     lines = [
-        {"partition": partition, "arm": arm, "run": run, "task": "lift", "seed": seed, "loss": 0.1 * rate + 0.01 * run,
+        {"partition": partition, "method": method, "run": run, "task": "lift", "seed": seed, "loss": 0.1 * rate + 0.01 * run,
          "action_error": 10 * (1 - rate), "success": rng.random() < rate}
-        for partition in ("iid", "task") for arm, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
-        for seed in range(40) if not (arm == "shared" and run == 3)
+        for partition in ("iid", "task") for method, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
+        for seed in range(40) if not (method == "shared" and run == 3)
     ]  # fmt: skip
     found = results.differences(pd.DataFrame(lines), [("shared", "pooled")], seed=0)
     assert list(found.partition) == ["iid", "task"] and list(found.seeds) == [3, 3] and list(found.n) == [120, 120]

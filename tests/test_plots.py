@@ -57,7 +57,7 @@ def test_client_counts_stack_to_the_episodes_of_each_client():
 def test_success_bars_have_the_heights_and_intervals_of_the_table():
     table = pd.DataFrame(
         {
-            "arm": ["base", "federated"] * 2,
+            "method": ["base", "federated"] * 2,
             "task": ["lift", "lift", "push", "push"],
             "success_rate": [0.1, 0.8, 0.0, 0.5],
             "low": [0.0, 0.6, 0.0, 0.3],
@@ -129,7 +129,7 @@ def test_client_statistics_and_weights_show_every_client():
     assert [bar.get_height() for bar in ax.patches] == [25, 75, 50, 50] and labelled(ax)
 
 
-def test_grouped_bars_give_every_number_a_bar_and_an_arm_its_colour():
+def test_grouped_bars_give_every_number_a_bar_and_an_method_its_colour():
     table = pd.DataFrame({"federated": [1.0, 2.0], "other": [3.0, 4.0]}, index=["lift", "push"])
     ax = plots.grouped_bars(table, xlabel="task", ylabel="loss")
     assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 4] and labelled(ax)
@@ -150,23 +150,21 @@ def test_cosine_map_writes_every_cosine():
     assert [text.get_text() for text in ax.texts] == ["1.00", "-0.25", "-0.25", "1.00"] and labelled(ax)
 
 
-def test_arms_and_their_differences_keep_their_intervals():
-    arms = pd.DataFrame({"arm": ["base"], "loss": [0.5], "success_rate": [0.2], "low": [0.1], "high": [0.4]})
-    ax = plots.loss_against_success(arms)
+def test_methods_and_their_differences_keep_their_intervals():
+    methods = pd.DataFrame({"method": ["base"], "loss": [0.5], "success_rate": [0.2], "low": [0.1], "high": [0.4]})
+    ax = plots.loss_against_success(methods)
     np.testing.assert_allclose(ax.containers[0].lines[0].get_xydata(), [[0.5, 0.2]])
     assert labelled(ax)
-    pairs = pd.DataFrame(
-        {"arm": ["federated"], "other": ["base"], "difference": [0.3], "low": [0.1], "high": [0.5]}
-    )
+    pairs = pd.DataFrame({"method": ["federated"], "other": ["base"], "difference": [0.3], "low": [0.1], "high": [0.5]})
     ax = plots.paired_differences(pairs)
     segment = ax.containers[0].lines[2][0].get_segments()[0]
     np.testing.assert_allclose(segment[:, 0], [10, 50])
     assert labelled(ax) and ax.get_yticklabels()[0].get_text() == "federated − base"
 
 
-def test_differences_have_a_panel_for_each_other_arm_and_a_row_for_each_partition():
+def test_differences_have_a_panel_for_each_other_method_and_a_row_for_each_partition():
     table = pd.DataFrame(
-        {"partition": ["iid", "task", "task"], "arm": "averaged", "other": ["pooled", "pooled", "alone"],
+        {"partition": ["iid", "task", "task"], "method": "averaged", "other": ["pooled", "pooled", "alone"],
          "difference": [-0.02, -0.1, 0.5], "low": [-0.03, -0.2, 0.4], "high": [0.01, -0.05, 0.7]}
     )  # fmt: skip
     axes = plots.differences_by_partition(table)
@@ -281,7 +279,7 @@ def test_curves_draw_every_column_against_the_index():
 
 def test_success_intervals_show_rate_and_both_ends_in_percent():
     table = pd.DataFrame(
-        {"arm": ["a", "b", "a"], "partition": ["iid", "iid", "task"], "success_rate": [0.5, 0.8, 0.1],
+        {"method": ["a", "b", "a"], "partition": ["iid", "iid", "task"], "success_rate": [0.5, 0.8, 0.1],
          "low": [0.4, 0.7, 0.0], "high": [0.6, 0.9, 0.3]}
     )  # fmt: skip
     ax = plots.success_intervals(table)
@@ -291,14 +289,14 @@ def test_success_intervals_show_rate_and_both_ends_in_percent():
     np.testing.assert_allclose(points["task"][:, 0], [10])
     (_, _, (bars,)) = ax.containers[1]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], [0, 30])
-    assert round(points["task"][0, 1]) == 0  # in the row of its arm
+    assert round(points["task"][0, 1]) == 0  # in the row of its method
     alone = plots.success_intervals(table[:2], ylabel="statistics")
     assert alone.get_ylabel() == "statistics" and alone.get_legend() is None  # one partition needs no name
 
 
 def test_success_by_bytes_names_every_point():
     table = pd.DataFrame(
-        {"arm": ["a", "b"], "MB": [10.0, 100.0], "success_rate": [0.2, 0.9], "low": [0.1, 0.8], "high": [0.3, 1.0]}
+        {"method": ["a", "b"], "MB": [10.0, 100.0], "success_rate": [0.2, 0.9], "low": [0.1, 0.8], "high": [0.3, 1.0]}
     )
     ax = plots.success_by_bytes(table)
     assert labelled(ax) and ax.get_xscale() == "log"
@@ -307,7 +305,9 @@ def test_success_by_bytes_names_every_point():
 
 
 def test_success_by_bytes_sets_points_of_equal_bytes_apart():
-    same = pd.DataFrame({"arm": list("abc"), "MB": [10.0, 600.0, 600.0], "success_rate": 0.9, "low": 0.8, "high": 1.0})
+    same = pd.DataFrame(
+        {"method": list("abc"), "MB": [10.0, 600.0, 600.0], "success_rate": 0.9, "low": 0.8, "high": 1.0}
+    )
     ax = plots.success_by_bytes(same)
     alone, left, right = (container.lines[0].get_xdata()[0] for container in ax.containers)
     assert alone == 10 and 0.9 * 600 < left < 600 < right < 1.1 * 600
@@ -316,12 +316,12 @@ def test_success_by_bytes_sets_points_of_equal_bytes_apart():
 
 def checkpoint_table():
     return pd.DataFrame(
-        {"arm": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],
+        {"method": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],
          "loss": [3.0, 1.0, 5.0, 2.0, 3.0, 2.5, 2.0], "success_rate": [0.0, 0.4, 0.0, 0.8, 0.0, np.nan, 0.5]}
     )  # fmt: skip
 
 
-def test_two_curves_of_one_arm_can_be_told_apart():
+def test_two_curves_of_one_method_can_be_told_apart():
     table = pd.DataFrame({"FedAvg, nobody attacks": [3.0, 1.0], "FedAvg": [3.0, 4.0], "Krum": [3.0, 2.0]})
     honest, attacked, krum = plots.curves(table, xlabel="round", ylabel="loss").get_lines()
     assert honest.get_color() == attacked.get_color() != krum.get_color()
@@ -361,7 +361,7 @@ def test_heat_maps_share_a_scale_and_leave_gaps():
 
 def test_success_per_megabyte_is_points_over_bytes_with_the_ends_of_the_interval():
     table = pd.DataFrame(
-        {"arm": ["a", "b"], "MB": [50.0, 10.0], "success_rate": [0.5, 0.2], "low": [0.4, 0.1], "high": [0.7, 0.3]}
+        {"method": ["a", "b"], "MB": [50.0, 10.0], "success_rate": [0.5, 0.2], "low": [0.4, 0.1], "high": [0.7, 0.3]}
     )
     ax = plots.success_per_megabyte(table)
     assert [bar.get_width() for bar in ax.patches] == pytest.approx([1, 2])
@@ -388,9 +388,9 @@ def test_client_drift_draws_every_local_phase_and_the_averages():
     np.testing.assert_allclose(averages.get_xydata(), server)
 
 
-def test_arms_and_clients_have_one_colour_each():
-    assert len({plots.method_color(arm) for arm in plots.METHOD_COLORS}) == len(plots.METHOD_COLORS)
-    for figure in (plots.curves, plots.grouped_bars):  # wherever an arm stands among others
+def test_methods_and_clients_have_one_colour_each():
+    assert len({plots.method_color(method) for method in plots.METHOD_COLORS}) == len(plots.METHOD_COLORS)
+    for figure in (plots.curves, plots.grouped_bars):  # wherever an method stands among others
         table = pd.DataFrame({"other": [1.0, 2.0], "centralized": [1.0, 2.0]})
         ax = figure(table, xlabel="x", ylabel="y")
         found = ax.lines[1].get_color() if ax.lines else matplotlib.colors.to_hex(ax.patches[2].get_facecolor())

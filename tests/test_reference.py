@@ -82,21 +82,21 @@ def test_each_stored_cell_was_run_with_the_settings_that_its_file_plans():
             stored, asked = json.loads((folder / "config.json").read_text()), asdict(cell.config)
             assert acting(stored) == acting({name: asked[name] for name in stored}), folder
             assert all(asked[name] == default[name] for name in asked.keys() - stored.keys()), folder
-            assert [stamp[key] for key in ("arm", "kind", "partition", "seed")] == [
-                cell.arm, cell.kind, cell.partition, cell.seed,
+            assert [stamp[key] for key in ("method", "kind", "partition", "seed")] == [
+                cell.method, cell.kind, cell.partition, cell.seed,
             ], folder  # fmt: skip
-            attempts = run_folder.read_metrics(folder, "rollout")
-            last = attempts[attempts["round"] == attempts["round"].max()]
+            rollouts = run_folder.read_metrics(folder, "rollout")
+            last = rollouts[rollouts["round"] == rollouts["round"].max()]
             if cell.kind != "clients":  # each of those has seeds of its own
                 assert set(last.seed) == set(plan.rollout_seeds), folder
 
 
 @pytest.mark.parametrize("name", ["strategies", "communication", "multitask"])
-def test_cells_of_a_grid_spend_equal_steps_and_have_three_seeds_and_fifty_attempts_at_each_task(name):
+def test_cells_of_a_grid_spend_equal_steps_and_have_three_seeds_and_fifty_rollouts_at_each_task(name):
     rows = results.read_results(REFERENCE / name)
     assert rows.gradient_steps.nunique() == 1
-    assert (rows.groupby(["partition", "arm"]).run.nunique() >= 3).all()
-    runs = rows.groupby(["partition", "arm", "run"])
+    assert (rows.groupby(["partition", "method"]).run.nunique() >= 3).all()
+    runs = rows.groupby(["partition", "method", "run"])
     assert (runs.task.nunique() == rows.task.nunique()).all()
     assert (rows.groupby([*runs.keys, "task"]).seed.nunique() >= 50).all()
 

@@ -17,8 +17,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def rounds(*lines):
-    """Checkpoints from (arm, run, round, loss, successes, n)."""
-    table = pd.DataFrame(lines, columns=["arm", "run", "round", "loss", "successes", "n"]).assign(partition="task")
+    """Checkpoints from (method, run, round, loss, successes, n)."""
+    table = pd.DataFrame(lines, columns=["method", "run", "round", "loss", "successes", "n"]).assign(partition="task")
     return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
 
 
@@ -28,12 +28,12 @@ def test_correlations_are_of_ranks_within_each_run_and_over_all():
         ("b", 0, 1, 0.5, 2, 10), ("b", 0, 2, 0.6, 3, 10), ("b", 1, 1, 0.7, 4, 10), ("b", 1, 2, 0.8, 4, 10),
     )  # fmt: skip
     found = tables.correlations(table)
-    assert found[["arm", "run"]].values.tolist() == [["a", 0], ["b", 0], ["b", 1], ["all", "all"]]
-    assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without an attempt is none
+    assert found[["method", "run"]].values.tolist() == [["a", 0], ["b", 0], ["b", 1], ["all", "all"]]
+    assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without an rollout is none
     np.testing.assert_allclose(found.rho[:3], [-1, 1, np.nan])  # all alike: no rank, and no warning
     seen = table[table.n > 0]
     assert found.rho.iloc[-1] == pytest.approx(seen.loss.rank().corr(seen.success_rate.rank()))
-    assert tables.correlations(table, ["run"])[["arm", "run", "n"]].values.tolist() == [
+    assert tables.correlations(table, ["run"])[["method", "run", "n"]].values.tolist() == [
         ["all", 0, 5], ["all", 1, 2], ["all", "all", 7],
     ]  # fmt: skip
 
@@ -48,11 +48,11 @@ def test_clear_pairs_are_apart_and_disagreements_are_those_that_the_loss_mislead
     apart = (pairs.low > pairs.other_high) | (pairs.high < pairs.other_low)
     assert apart.all() and len(pairs) == 8  # of 10: one has equal losses, in one the intervals overlap
     assert pairs.same_run.sum() == 2 and pairs.same_episodes.sum() == 4
-    assert not pairs[pairs.same_run & (pairs.arm == "a")].misled.any()
+    assert not pairs[pairs.same_run & (pairs.method == "a")].misled.any()
 
     found = tables.disagreements(table)
     assert (found.success_rate < found.other_success_rate).all() and found.gap.is_monotonic_decreasing
-    named = found[["arm", "run", "round", "other_arm", "other_run", "other_round"]].values.tolist()
+    named = found[["method", "run", "round", "other_method", "other_run", "other_round"]].values.tolist()
     assert named == [["b", 1, 1, "b", 1, 2], ["b", 1, 1, "b", 0, 1], ["a", 0, 2, "b", 0, 1], ["b", 1, 1, "a", 0, 2]]
     assert found.gap[0] == pytest.approx(found.other_low[0] - found.high[0])
 
@@ -63,17 +63,17 @@ def test_without_a_clear_pair_the_tables_are_empty():
     assert np.isnan(tables.correlations(rounds(("a", 0, 1, 0.5, 0, 0))).rho.iloc[-1])
 
 
-def attempts(*cells):
-    """Two attempts of two training seeds for each (partition, arm, kind, recording)."""
+def rollouts(*cells):
+    """Two rollouts of two training seeds for each (partition, method, kind, recording)."""
     return pd.DataFrame([
-        {"partition": partition, "arm": arm, "kind": kind, "recording": recording, "run": run, "seed": seed,
+        {"partition": partition, "method": method, "kind": kind, "recording": recording, "run": run, "seed": seed,
          "success": place > 3}
-        for place, (partition, arm, kind, recording) in enumerate(cells) for run in (0, 1) for seed in (7, 8)
+        for place, (partition, method, kind, recording) in enumerate(cells) for run in (0, 1) for seed in (7, 8)
     ])  # fmt: skip
 
 
-def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
-    table = attempts(
+def test_methods_that_see_no_partition_are_lent_to_those_of_the_same_recording():
+    table = rollouts(
         ("task", "start", "base", "one"), ("task", "pooled", "centralized", "one"),
         ("task", "shared", "federated", "one"), ("iid", "shared", "federated", "one"),
         ("uneven", "shared", "federated", "one"), ("uneven", "start", "base", "one"),
@@ -82,11 +82,11 @@ def test_arms_that_see_no_partition_are_lent_to_those_of_the_same_recording():
     found = tables.repeat_partition_free(table)
     pd.testing.assert_frame_equal(found[: len(table)], table)
     lent = found[len(table) :]
-    assert set(zip(lent.partition, lent.arm, strict=True)) == {
+    assert set(zip(lent.partition, lent.method, strict=True)) == {
         ("iid", "start"), ("iid", "pooled"), ("uneven", "pooled"),
     }  # fmt: skip
     assert not lent.success.any() and len(lent) == 3 * 4  # those of partition task, not of another recording
-    assert not found.duplicated(["partition", "arm", "run", "seed"]).any()
+    assert not found.duplicated(["partition", "method", "run", "seed"]).any()
 
 
 def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_several():
@@ -100,10 +100,10 @@ def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_sever
 
 
 def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
-    here = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "lab")))
+    here = rollouts(*((part, "shared", "federated", "one") for part in ("task", "iid", "lab")))
     here = here[(here.partition != "iid") | (here.run == 0)]
-    here.loc[here.partition == "lab", "arm"] = "alone"
-    there = attempts(*((part, "shared", "federated", "one") for part in ("task", "iid", "uneven"))).assign(run=5)
+    here.loc[here.partition == "lab", "method"] = "alone"
+    there = rollouts(*((part, "shared", "federated", "one") for part in ("task", "iid", "uneven"))).assign(run=5)
     found = tables.fill_in(here, there, "shared")
     assert found.groupby("partition").run.unique().map(list).to_dict() == {"task": [0, 1], "iid": [5], "uneven": [5]}
 
@@ -114,14 +114,16 @@ COMPARISON = ROOT / "book" / "reference" / "comparison"
 def test_steps_of_cells_without_counts_follow_from_settings_for_each_model_and_are_said_to():
     rows = results.read_results(COMPARISON)
     rows = rows[~rows.counted & (rows.partition == "task") & (rows.run == 0)]
-    found = rows.groupby("arm")[["gradient_steps", "steps_in_all", "steps_in_a_row"]].agg(lambda of: of.unique().item())
+    found = rows.groupby("method")[["gradient_steps", "steps_in_all", "steps_in_a_row"]].agg(
+        lambda of: of.unique().item()
+    )
     assert found.loc["local-only"].tolist() == [800, 80, 80]  # ten clients: the sum is no client's
     assert found.loc["fedavg-200x2x2"].tolist() == [800, 800, 400]
     assert found.loc["fedavg-10x4x20"].tolist() == [800, 800, 200]
     assert found.loc["centralized"].tolist() == [800, 800, 800] and found.loc["base"].tolist() == [0, 0, 0]
 
 
-def test_counts_of_a_stamp_are_read_for_the_model_that_made_each_attempt(tmp_path):
+def test_counts_of_a_stamp_are_read_for_the_model_that_made_each_rollout(tmp_path):
     cell = Path(shutil.copytree(COMPARISON / "task_local-only_0", tmp_path / "task_local-only_0"))
     counts = {f"client_{k}": {"in_all": 100 + k, "in_a_row": 90 + k} for k in range(10)}
     stamp = json.loads((cell / "stamp.json").read_text())
@@ -135,36 +137,36 @@ def test_counts_of_a_stamp_are_read_for_the_model_that_made_each_attempt(tmp_pat
 
 def test_a_clients_own_task_is_the_one_that_partitions_deal_to_it():
     rows = results.read_results(COMPARISON)
-    alone = rows[(rows.partition == "task") & (rows.arm == "local-only") & (rows.run == 0)]
+    alone = rows[(rows.partition == "task") & (rows.method == "local-only") & (rows.run == 0)]
     episodes = [{"episode_id": number, "task": task} for number, task in enumerate(["push", "lift", "place"] * 40)]
     parts = partition_module.partition(pd.DataFrame(episodes), 10, "task")
     held = [{episodes[number]["task"] for number in part} for part in parts]
     assert [len(tasks) for tasks in held] == [1] * 10
     expected = [task in held[int(client)] for task, client in zip(alone.task, alone.client, strict=True)]
     assert tables.at_own_task(alone).tolist() == expected and sum(expected) == len(alone) / 3
-    assert not tables.at_own_task(rows[rows.arm == "centralized"]).any()
-    assert not tables.at_own_task(rows[rows.arm == "centralized"].drop(columns="client")).any()
+    assert not tables.at_own_task(rows[rows.method == "centralized"]).any()
+    assert not tables.at_own_task(rows[rows.method == "centralized"].drop(columns="client")).any()
 
 
-def test_arms_are_named_by_their_steps_and_those_alone_split_by_whose_task_it_was():
+def test_methods_are_named_by_their_steps_and_those_alone_split_by_whose_task_it_was():
     rows = results.read_results(COMPARISON)
     rows = rows[(rows.partition == "task") & (rows.run == 0)]
     named = tables.by_steps(rows)
     assert len(named) == len(rows) and named.success.sum() == rows.success.sum()
-    names = list(dict.fromkeys(named.arm))
+    names = list(dict.fromkeys(named.method))
     assert names[:3] == ["base, 0 steps", "local-only, own task, 80 steps", "local-only, other tasks, 80 steps"]
     assert {"centralized, 800 steps", "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(names)
-    own = rows[(rows.arm == "local-only") & tables.at_own_task(rows)]
-    assert named[named.arm == names[1]].success.mean() == own.success.mean()
+    own = rows[(rows.method == "local-only") & tables.at_own_task(rows)]
+    assert named[named.method == names[1]].success.mean() == own.success.mean()
 
 
 @pytest.mark.parametrize("seeds", [1, 5])
-def test_labs_alone_are_held_against_the_federation_on_the_very_attempts_at_their_own_tasks(seeds):
+def test_labs_alone_are_held_against_the_federation_on_the_very_rollouts_at_their_own_tasks(seeds):
     rows = results.read_results(COMPARISON)
     rows = rows[(rows.partition == "task") & (rows.run < seeds)]
     found = tables.beside_own_tasks(rows, "local-only", "fedavg-200x2x2", seed=0)
-    own = rows[(rows.arm == "local-only") & tables.at_own_task(rows)]
-    same = rows[rows.arm == "fedavg-200x2x2"].merge(own[["run", "task", "seed"]])
+    own = rows[(rows.method == "local-only") & tables.at_own_task(rows)]
+    same = rows[rows.method == "fedavg-200x2x2"].merge(own[["run", "task", "seed"]])
     assert found["seeds"] == seeds and found["n"] == len(own) == len(same) == 100 * seeds
     assert found["success_rate"] == own.success.mean() and found["other_rate"] == same.success.mean()
     assert found["difference"] == pytest.approx(own.success.mean() - same.success.mean())
@@ -173,7 +175,7 @@ def test_labs_alone_are_held_against_the_federation_on_the_very_attempts_at_thei
 
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):
-    known = {"arm": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1, "samples": 1,
+    known = {"method": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1, "samples": 1,
              "bytes": 0, "train_s": None}  # fmt: skip
     (tmp_path / "task_pooled_0").mkdir()
     (tmp_path / "task_pooled_0" / "stamp.json").write_text(json.dumps(known))

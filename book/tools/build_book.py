@@ -52,7 +52,7 @@ FILM = b"<!-- film -->"  # on the front page: the federated policy in this build
 FILMED_IN = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
 OUTCOME = "book/_static/outcome.png"  # the figure of it
-FEDERATED, POOLED, ALONE, LONGER = "fedavg-200x2x2", "centralized", "local-only", "local-only-800"  # arms it tells of
+FEDERATED, POOLED, ALONE, LONGER = "fedavg-200x2x2", "centralized", "local-only", "local-only-800"  # methods it tells of
 NEARLY_SOLVED = 0.8  # success of labs alone above which their tasks leave little for a federation to add
 DEALT = {"iid": "the same mix of tasks in every lab", "dirichlet-0_5": "uneven mixes (Dirichlet, 0.5)",
          "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task a lab",
@@ -62,7 +62,7 @@ TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
 # Pages that end with results of benchmarks that were kept.
 RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
-    "book/reference_runs.md": ["four_arms"],
+    "book/reference_runs.md": ["four_methods"],
     "book/speed.md": [
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
     ],
@@ -71,8 +71,9 @@ RESULTS_ON = {
 TITLES = {
     "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
     "floor": "the floor",
-    "four_arms": "one federation after another, its clients alone with their share of the steps, and centralized",
+    "four_methods": "one federation after another, its clients alone with their share of the steps, and centralized",
 }
+PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 BENCHMARKS = "benchmarks/results"
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results, as chapters name it
 BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
@@ -96,8 +97,8 @@ class Chapter:
 
 def library_key(root: Path, profile: str) -> str:
     """Return a digest of everything but the notebook that a chapter's results depend on."""
-    library = (path for path in (root / "fedvla_lib").rglob("*") if "__pycache__" not in path.parts)
-    files = [*sorted(library), root / "requirements.lock"]
+    packages = [path for name in PACKAGES for path in (root / name).rglob("*") if "__pycache__" not in path.parts]
+    files = [*sorted(packages), root / "requirements.lock"]
     return _digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
 
 
@@ -342,7 +343,7 @@ def _write_if_changed(path: Path, content: bytes) -> None:
 
 
 def _film(chapter: Path, profile: str) -> str:
-    """The federated policy's first attempt of the last evaluated round, as a chapter shows it, whatever came of it."""
+    """The federated policy's first rollout of the last evaluated round, as a chapter shows it, whatever came of it."""
     outputs = [output for cell in nbformat.read(chapter, as_version=4).cells for output in cell.get("outputs", [])]
     pages = [output.get("data", {}).get("text/html", "") for output in outputs]
     films = [film for page in pages for film in re.findall(r"<figure.*?</figure>", page, flags=re.DOTALL)]
@@ -363,23 +364,23 @@ def _headline(comparison: Path) -> str:
     """
     rows = tables.repeat_partition_free(results.read_results(comparison))
     of_task = rows[rows.partition == "task"]
-    of_arm = results.summary(of_task).set_index("arm")
+    of_method = results.summary(of_task).set_index("method")
     labs, tasks = of_task.client.nunique(), of_task.task.nunique()
     return "\n".join([
         f"**What comes out.** Each of {labs} labs holds demonstrations of one of {tasks} tasks.",
-        *_at_equal_total(of_arm), _gaps(rows), *_with_its_share(of_arm), *_with_steps_of_its_own(of_task),
-        _counting(of_arm), "", _outcome_figure(of_arm),
+        *_at_equal_total(of_method), _gaps(rows), *_with_its_share(of_method), *_with_steps_of_its_own(of_task),
+        _counting(of_method), "", _outcome_figure(of_method),
     ])  # fmt: skip
 
 
-def _at_equal_total(of_arm: pd.DataFrame) -> list[str]:
-    federated, pooled = of_arm.loc[FEDERATED], of_arm.loc[POOLED]
-    if federated.steps_in_all != pooled.steps_in_all or federated.attempts != pooled.attempts:
+def _at_equal_total(of_method: pd.DataFrame) -> list[str]:
+    federated, pooled = of_method.loc[FEDERATED], of_method.loc[POOLED]
+    if federated.steps_in_all != pooled.steps_in_all or federated.rollouts != pooled.rollouts:
         raise BookError(f"{FEDERATED} and {POOLED} differ in steps in all or in rollouts: the front page says equal")
     return [
         f"After {federated.steps_in_all:,.0f} gradient steps in all, the federated model succeeds in "
         f"{_rate_of(federated)} of rollouts, and training on all demonstrations in one place in {_rate_of(pooled)}, "
-        f"each in {federated.attempts:,} rollouts over {federated.seeds} training seeds.",
+        f"each in {federated.rollouts:,} rollouts over {federated.seeds} training seeds.",
         f"The labs of a round train side by side, so the federated model has walked {federated.steps_in_a_row:,.0f} "
         f"steps in a row, the pooled one {pooled.steps_in_a_row:,.0f}.",
     ]
@@ -391,11 +392,11 @@ def _gaps(rows: pd.DataFrame) -> str:
     return f"Federated minus pooled: {'; '.join(gaps)}."
 
 
-def _with_its_share(of_arm: pd.DataFrame) -> list[str]:
-    alone = of_arm.loc[ALONE]
+def _with_its_share(of_method: pd.DataFrame) -> list[str]:
+    alone = of_method.loc[ALONE]
     return [
         f"A lab alone with only its share of the steps, {alone.steps_in_all:,.0f}, succeeds in {_rate_of(alone)} of "
-        f"{alone.attempts:,} rollouts over {alone.seeds} training seeds.",
+        f"{alone.rollouts:,} rollouts over {alone.seeds} training seeds.",
         "It was judged on all tasks, most of which it never saw: "
         "this number is no measure of what a lab can do alone.",
     ]
@@ -403,7 +404,7 @@ def _with_its_share(of_arm: pd.DataFrame) -> list[str]:
 
 def _with_steps_of_its_own(of_task: pd.DataFrame) -> list[str]:
     """Labs alone after as many steps as the federation, at their own task, and the federated model beside them."""
-    longer = of_task[of_task.arm == LONGER]
+    longer = of_task[of_task.method == LONGER]
     steps, elsewhere = longer.steps_in_all.mean(), longer[~tables.at_own_task(longer)]
     found = tables.beside_own_tasks(of_task, LONGER, FEDERATED, seed=0)
     rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
@@ -422,23 +423,23 @@ def _with_steps_of_its_own(of_task: pd.DataFrame) -> list[str]:
     ]
 
 
-def _counting(of_arm: pd.DataFrame) -> str:
+def _counting(of_method: pd.DataFrame) -> str:
     told = "Brackets are 95 % intervals, and {doc}`/notebooks/06_federated_vs_centralized` says how they were made."
-    planned = [f"`{arm}`" for arm, counted in of_arm.counted.items() if not counted]
+    planned = [f"`{method}`" for method, counted in of_method.counted.items() if not counted]
     if not planned:
         return told
     return f"{told}\nThe steps of {', '.join(planned)} follow from their settings: those runs are older than counting."
 
 
-def _outcome_figure(of_arm: pd.DataFrame) -> str:
-    few = [f"`{arm}`" for arm, seeds in of_arm.seeds.items() if seeds == 1]
+def _outcome_figure(of_method: pd.DataFrame) -> str:
+    few = [f"`{method}`" for method, seeds in of_method.seeds.items() if seeds == 1]
     once = f" Of one training seed, with intervals for other rollouts only: {', '.join(few)}." if few else ""
     return (
         f"```{{figure}} {Path(OUTCOME).relative_to('book').as_posix()}\n"
-        ":alt: Points with intervals, one row an arm with the gradient steps of its model: success rates of the base, "
+        ":alt: Points with intervals, one row an method with the gradient steps of its model: success rates of the base, "
         "of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
         ":width: 100%\n\n"
-        "Success of each arm with one task a lab, and the gradient steps of one model of it. Of labs alone, rollouts "
+        "Success of each method with one task a lab, and the gradient steps of one model of it. Of labs alone, rollouts "
         f"at their own task and at other tasks stand apart.{once}\n```"
     )
 
@@ -447,7 +448,7 @@ def _outcome(comparison: Path) -> bytes:
     """The figure under the front page's sentences, as PNG."""
     rows = tables.repeat_partition_free(results.read_results(comparison))
     plots.use_style()
-    axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="arm")
+    axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="method")
     with tempfile.TemporaryDirectory() as folder:
         plots.save(axes, Path(folder) / "outcome.png")
         return (Path(folder) / "outcome.png").read_bytes()
@@ -500,7 +501,7 @@ def _card_tables(account: dict) -> str:
         f"## The account\n\n{made}\n## Success\n\nIn the reference laboratory, on seeds that no demonstration has. "
         "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, never seen, "
         f"so this is what the base can do before any lab has trained.\n\n{success}\n## Does the sentence decide?\n\n"
-        "Two cubes of different colours stand on the table. Success is counted for one of them, while the arm is told "
+        "Two cubes of different colours stand on the table. Success is counted for one of them, while the method is told "
         f"its colour or the other one's.\n\n{told}\n"
     )
 
@@ -536,7 +537,7 @@ def render(source: Path, output: Path) -> Path:
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
     options = ["-W", "-n", "--keep-going", "--quiet"]
     # Where site_scripts.py lies, and the library whose functions are described.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT)])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")])}
     # Warnings are on stderr.
     built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
     if built.returncode:

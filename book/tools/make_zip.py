@@ -20,7 +20,7 @@ PACKED = ["notebooks/*.ipynb", "book/reference/**/*", "requirements.lock", "LICE
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 README = """{title}
 
-The notebooks of the book, the stored results that they read, and the library. You need Python {python}.
+The notebooks of the book, the stored results that they read, and the packages that they import. You need Python {python}.
 
 Install, in this folder:
 
@@ -44,7 +44,8 @@ def build_wheel(root: Path, folder: Path) -> Path:
     """
     with tempfile.TemporaryDirectory(prefix="fedvla-wheel-") as name:
         source = Path(name)
-        shutil.copytree(root / "fedvla_lib", source / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+        for package in ("fedvla_lib", "book/fedvla_book"):
+            shutil.copytree(root / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
         for file in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copy(root / file, source)
         command = [sys.executable, "-c", BUILD, str(folder.resolve())]

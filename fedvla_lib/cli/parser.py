@@ -150,7 +150,7 @@ def _add_credentials(commands: Any) -> None:
 
 def _add_experiment(commands: Any) -> None:
     kept = "finished cells are kept, the same command continues"
-    parser = _command(commands, "experiment", experiment, "train and measure a grid of arms and seeds", kept)
+    parser = _command(commands, "experiment", experiment, "train and measure a grid of methods and seeds", kept)
     parser.add_argument(
         "file", type=Path, help="what to measure: a TOML file, see fedvla_lib/experiments/experiment.py"
     )
@@ -161,7 +161,7 @@ def _add_search(commands: Any) -> None:
     kept = "finished trials are kept, the same command continues"
     parser = _command(commands, "search", search, "search for settings of a federation at equal gradient steps", kept)
     parser.add_argument("--trials", type=int, default=20, metavar="N", help="settings to try (default: 20)")
-    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="attempts at each task (default: 20)")
+    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="rollouts at each task (default: 20)")
     parser.add_argument("--search-out", type=Path, required=True, metavar="DIR", help="folder of trials and result")
     _add_settings(parser)
 
@@ -194,7 +194,7 @@ def _add_evaluate(commands: Any) -> None:
     parser = _command(commands, "evaluate", evaluate, "let a saved policy act and count its successes", kept)
     parser.add_argument("policy", type=Path, help="a pretrained_model folder, such as <run>/global_model/round_4")
     parser.add_argument("--task", action="append", metavar="NAME", help="a task; repeat for several (default: all)")
-    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="attempts at each task (default: 20)")
+    parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="rollouts at each task (default: 20)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for videos and rows.csv (default: none)")
     parser.add_argument("--seed", type=int, default=0, help="fixes the noise of the policy (default: 0)")
 

@@ -1,7 +1,7 @@
 """Run folders -> one table of differences, after a check that the runs can be compared at all.
 
-Each run is read at its last measured round: its held-out episodes one by one, and its attempts one by one, so that
-two runs are compared episode by episode and attempt by attempt. The first run is the one the others are held against.
+Each run is read at its last measured round: its held-out episodes one by one, and its rollouts one by one, so that
+two runs are compared episode by episode and rollout by rollout. The first run is the one the others are held against.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ LAST = ["p_value", "p_holm", "mismatch"]  # columns after the effect and its int
 # Settings that decide what is measured, or from where training starts.
 ALIKE = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction", "base", "chunk_size",
          "batch_size", "action_tolerance_deg")  # fmt: skip
-IN_LOSS = ("normalisation",)  # decides the unit of the loss, though not of what the arm does
+IN_LOSS = ("normalisation",)  # decides the unit of the loss, though not of what the method does
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Run:
     config: Config
     gradient_steps: int
     episodes: pd.DataFrame  # by episode_id: num_examples, loss, action_error, action_accuracy
-    attempts: pd.DataFrame  # task, lab, seed, success
+    rollouts: pd.DataFrame  # task, lab, seed, success
 
 
 def read_run(folder: Path) -> Run:
@@ -50,9 +50,9 @@ def read_run(folder: Path) -> Run:
     held_out = _last(run_folder.read_metrics(folder, "held-out"))
     if held_out.empty:
         raise ValueError(f"{folder} measured no held-out episode: let the run end, with val-fraction above 0")
-    attempts = _last(run_folder.read_metrics(folder, "rollout"))
-    attempts = attempts[[*ATTEMPT, "success"]] if len(attempts) else pd.DataFrame(columns=[*ATTEMPT, "success"])
-    return Run(folder.name, config, _gradient_steps(folder, config), held_out.set_index("episode_id"), attempts)
+    rollouts = _last(run_folder.read_metrics(folder, "rollout"))
+    rollouts = rollouts[[*ATTEMPT, "success"]] if len(rollouts) else pd.DataFrame(columns=[*ATTEMPT, "success"])
+    return Run(folder.name, config, _gradient_steps(folder, config), held_out.set_index("episode_id"), rollouts)
 
 
 def _last(rows: pd.DataFrame) -> pd.DataFrame:
@@ -102,7 +102,7 @@ def _label(first: Run, other: Run, metric: str) -> str:
 
 
 def _keys(run: Run) -> set[tuple[Any, ...]]:
-    return set(run.attempts[ATTEMPT].itertuples(index=False, name=None))
+    return set(run.rollouts[ATTEMPT].itertuples(index=False, name=None))
 
 
 def values(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confidence: float) -> pd.DataFrame:
@@ -124,9 +124,9 @@ def _value(run: Run, metric: str, seed: int, confidence: float) -> dict[str, flo
         each = run.episodes[metric].to_numpy()
         low, high = statistics.mean_interval(each, seed=seed, confidence=confidence)
         return {"n": len(each), "value": float(each.mean()), "low": low, "high": high}
-    if run.attempts.empty:
-        raise ValueError(f"{run.name} made no attempt: run it with eval-rollouts above 0, or leave out {SUCCESS}")
-    n, successes = len(run.attempts), int(run.attempts.success.sum())
+    if run.rollouts.empty:
+        raise ValueError(f"{run.name} made no rollout: run it with eval-rollouts above 0, or leave out {SUCCESS}")
+    n, successes = len(run.rollouts), int(run.rollouts.success.sum())
     low, high = statistics.wilson(successes, n, confidence)
     return {"n": n, "value": successes / n, "low": low, "high": high}
 
@@ -135,7 +135,7 @@ def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confi
     """Return a row for each metric and each run but the first, that run minus the first, over what both measured.
 
     The effect comes first: the difference in the metric's own unit with its interval, a paired bootstrap over held-out
-    episodes or attempts, and `visible`, the smallest difference that so many pairs would have shown with a power of
+    episodes or rollouts, and `visible`, the smallest difference that so many pairs would have shown with a power of
     80 %. Then p-values: those of the table are one family, and `p_holm` are Holm's (1979). `mismatch` names what makes
     the two incomparable.
     """
@@ -152,8 +152,8 @@ def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confi
 
 def _difference(run: Run, first: Run, metric: str, seed: int, confidence: float) -> dict[str, Any]:
     if metric == SUCCESS:
-        pairs = run.attempts.merge(first.attempts, on=ATTEMPT, suffixes=("", "_first"))
-        _require_pairs(run, first, len(pairs), "attempt")
+        pairs = run.rollouts.merge(first.rollouts, on=ATTEMPT, suffixes=("", "_first"))
+        _require_pairs(run, first, len(pairs), "rollout")
         return statistics.success_difference(pairs.success, pairs.success_first, seed=seed, confidence=confidence)
     both = run.episodes.index.intersection(first.episodes.index)
     _require_pairs(run, first, len(both), "held-out episode")

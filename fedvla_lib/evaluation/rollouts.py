@@ -110,7 +110,7 @@ def success_rate(rows: Sequence[dict[str, Any]]) -> float:
 def roll_out(
     bundle: model.Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False
 ) -> list[dict[str, Any]]:
-    """Let one model act on all tasks of the mix, in the laboratories of the run, and return a row for each attempt."""
+    """Let one model act on all tasks of the mix, in the laboratories of the run, and return a row for each rollout."""
     return evaluate(
         PolicyActor(bundle, config.seed), task_names(config), seeds, image_size=config.image_size,
         labs=labs(config.num_labs), videos_dir=videos_dir, progress=progress,

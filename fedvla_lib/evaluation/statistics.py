@@ -38,49 +38,51 @@ def success_table(rows: pd.DataFrame, by: Sequence[str], confidence: float = CON
     return table
 
 
-def paired(rows: pd.DataFrame, arm: str, other: str) -> pd.DataFrame:
-    """Line up the rollouts of two arms: one line per (task, seed) with both outcomes.
+def paired(rows: pd.DataFrame, method: str, other: str) -> pd.DataFrame:
+    """Line up the rollouts of two methods: one line per (task, seed) with both outcomes.
 
     Raises:
-        ValueError: an arm is unknown, or the arms did not run the same tasks and seeds.
+        ValueError: an method is unknown, or the methods did not run the same tasks and seeds.
     """
-    known = sorted(rows.arm.unique())
-    for name in (arm, other):
+    known = sorted(rows.method.unique())
+    for name in (method, other):
         if name not in known:
-            raise ValueError(f"unknown arm {name!r}: choose one of {', '.join(known)}")
-    left, right = (rows[rows.arm == name].set_index(["task", "seed"]).success.astype(bool) for name in (arm, other))
+            raise ValueError(f"unknown method {name!r}: choose one of {', '.join(known)}")
+    left, right = (
+        rows[rows.method == name].set_index(["task", "seed"]).success.astype(bool) for name in (method, other)
+    )
     if left.index.has_duplicates or right.index.has_duplicates:
-        raise ValueError(f"{arm!r} or {other!r} ran a (task, seed) twice: pairs must be unique")
+        raise ValueError(f"{method!r} or {other!r} ran a (task, seed) twice: pairs must be unique")
     if set(left.index) != set(right.index):
         odd = sorted(set(left.index) ^ set(right.index))[0]
-        raise ValueError(f"{arm!r} and {other!r} did not run the same rollouts: {odd} is in one only")
-    return pd.DataFrame({arm: left, other: right.loc[left.index]})
+        raise ValueError(f"{method!r} and {other!r} did not run the same rollouts: {odd} is in one only")
+    return pd.DataFrame({method: left, other: right.loc[left.index]})
 
 
 def paired_difference(
-    rows: pd.DataFrame, arm: str, other: str, *, seed: int, confidence: float = CONFIDENCE
+    rows: pd.DataFrame, method: str, other: str, *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
-    """Difference in success rate `arm` - `other` over the same rollouts, with the interval of `success_difference`.
+    """Difference in success rate `method` - `other` over the same rollouts, with the interval of `success_difference`.
 
-    Also McNemar's exact test on the discordant pairs (McNemar 1947): `only_arm` and `only_other` are the rollouts that
-    one arm alone solved.
+    Also McNemar's exact test on the discordant pairs (McNemar 1947): `only_method` and `only_other` are the rollouts that
+    one method alone solved.
     """
-    outcomes = paired(rows, arm, other)
-    found = success_difference(outcomes[arm], outcomes[other], seed=seed, confidence=confidence)
-    named = {"only_left": "only_arm", "only_right": "only_other"}
-    return {"arm": arm, "other": other, **{named.get(key, key): value for key, value in found.items()}}
+    outcomes = paired(rows, method, other)
+    found = success_difference(outcomes[method], outcomes[other], seed=seed, confidence=confidence)
+    named = {"only_left": "only_method", "only_right": "only_other"}
+    return {"method": method, "other": other, **{named.get(key, key): value for key, value in found.items()}}
 
 
 def success_difference(
     left: Sequence[bool], right: Sequence[bool], *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
-    """Difference of two success rates over the same attempts: left - right, Student's interval, McNemar's exact test.
+    """Difference of two success rates over the same rollouts: left - right, Student's interval, McNemar's exact test.
 
-    The interval is for independent attempts of one pair of models; with a handful of unequal outcomes it is rough.
+    The interval is for independent rollouts of one pair of models; with a handful of unequal outcomes it is rough.
 
     Returns:
         n: pairs; difference, low, high: the effect, in the measure's own unit; visible: the smallest difference that n
-        pairs with this share of unequal outcomes would show with a power of 80 %; only_left, only_right: attempts that
+        pairs with this share of unequal outcomes would show with a power of 80 %; only_left, only_right: rollouts that
         one of them alone solved; p_value.
     """
     left, right = np.asarray(left, bool), np.asarray(right, bool)
@@ -98,9 +100,9 @@ def success_difference(
 def unpaired_difference(
     left: tuple[int, int], right: tuple[int, int], confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Interval of left - right, two success rates of which only (successes, attempts) are known.
+    """Interval of left - right, two success rates of which only (successes, rollouts) are known.
 
-    Where both made the same attempts, `paired_difference` is narrower as a rule, but needs the outcome of each.
+    Where both made the same rollouts, `paired_difference` is narrower as a rule, but needs the outcome of each.
 
     Source: Newcombe 1998, Statistics in Medicine 17, 873-890, method 10: Wilson's intervals, combined.
     """
@@ -195,24 +197,24 @@ def mean_interval(
 
 
 def by_run(rows: pd.DataFrame) -> pd.DataFrame:
-    """Lay out the attempts of one arm: a line for each training seed (`run`), a column for each (task, seed), 0 or 1.
+    """Lay out the rollouts of one method: a line for each training seed (`run`), a column for each (task, seed), 0 or 1.
 
     Raises:
-        ValueError: an attempt occurs twice, or the seeds did not make the same attempts.
+        ValueError: an rollout occurs twice, or the seeds did not make the same rollouts.
     """
     if rows.duplicated(["run", "task", "seed"]).any():
-        raise ValueError("a training seed ran a (task, seed) twice: give the attempts of one arm and partition")
+        raise ValueError("a training seed ran a (task, seed) twice: give the rollouts of one method and partition")
     won = rows.astype({"success": float})
     table = won.pivot(index="run", columns=["task", "seed"], values="success").sort_index(axis=1)
     if table.isna().any(axis=None):
-        raise ValueError(f"training seeds {list(table.index[table.isna().any(axis=1)])} lack attempts of the others")
+        raise ValueError(f"training seeds {list(table.index[table.isna().any(axis=1)])} lack rollouts of the others")
     return table
 
 
 def success_interval(rows: pd.DataFrame, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Interval of an arm's success rate: Wilson's for one training seed, `over_seeds` for several.
+    """Interval of an method's success rate: Wilson's for one training seed, `over_seeds` for several.
 
-    Where all attempts of all seeds ended alike there is no variance to go by: Wilson's for the attempts of one seed.
+    Where all rollouts of all seeds ended alike there is no variance to go by: Wilson's for the rollouts of one seed.
     """
     if rows.run.nunique() == 1 or rows.success.nunique() == 1:
         one = rows[rows.run == rows.run.iloc[0]]
@@ -222,39 +224,39 @@ def success_interval(rows: pd.DataFrame, confidence: float = CONFIDENCE) -> tupl
 
 
 def difference_over_seeds(
-    rows: pd.DataFrame, arm: str, other: str, *, seed: int, confidence: float = CONFIDENCE
+    rows: pd.DataFrame, method: str, other: str, *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
-    """Difference in success rate `arm` - `other` over the same training seeds and attempts, for new ones of both.
+    """Difference in success rate `method` - `other` over the same training seeds and rollouts, for new ones of both.
 
     Returns:
         what `over_seeds` says of it; boot_low, boot_high of `crossed_bootstrap`; and for these very models n, the
-        attempts that one arm alone solved, and McNemar's exact p-value (`mcnemar_p`).
+        rollouts that one method alone solved, and McNemar's exact p-value (`mcnemar_p`).
 
     Raises:
-        ValueError: the arms do not have the same training seeds and attempts.
+        ValueError: the methods do not have the same training seeds and rollouts.
     """
-    left, right = (by_run(rows[rows.arm == name]) for name in (arm, other))
+    left, right = (by_run(rows[rows.method == name]) for name in (method, other))
     if not (left.index.equals(right.index) and left.columns.equals(right.columns)):
-        raise ValueError(f"{arm!r} and {other!r} differ in training seeds or attempts: they cannot be paired")
+        raise ValueError(f"{method!r} and {other!r} differ in training seeds or rollouts: they cannot be paired")
     pairs = success_difference(left.to_numpy().ravel(), right.to_numpy().ravel(), seed=seed, confidence=confidence)
     low, high = crossed_bootstrap(left - right, seed=seed, confidence=confidence)
     known = {key: pairs[key] for key in ("n", "only_left", "only_right")}
     found = over_seeds(left - right, confidence)
     p_values = {"p_value": found.pop("p_value"), "mcnemar_p": pairs["p_value"]}
-    return {"arm": arm, "other": other, **found, "boot_low": low, "boot_high": high, **known, **p_values}
+    return {"method": method, "other": other, **found, "boot_low": low, "boot_high": high, **known, **p_values}
 
 
 def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str, float]:
-    """Mean of outcomes (or paired differences) with an interval for other training seeds and other attempts.
+    """Mean of outcomes (or paired differences) with an interval for other training seeds and other rollouts.
 
-    Every seed makes every attempt, so the variance has three parts: between seeds, between attempts of a task, and the
-    rest. With S seeds and n attempts the variance of the mean is (MS_seeds + MS_attempts - MS_rest) / (S n), its
+    Every seed makes every rollout, so the variance has three parts: between seeds, between rollouts of a task, and the
+    rest. With S seeds and n rollouts the variance of the mean is (MS_seeds + MS_rollouts - MS_rest) / (S n), its
     degrees of freedom are Satterthwaite's (1946), and the interval is Student's. Simulated with known truth, 5 seeds
-    and 100 attempts cover it 93 to 97 % of the time; a bootstrap of so few seeds is too narrow where seeds matter and
+    and 100 rollouts cover it 93 to 97 % of the time; a bootstrap of so few seeds is too narrow where seeds matter and
     too wide where they do not.
 
     Args:
-        values: a line for each training seed, a column for each attempt (task, seed), or one column.
+        values: a line for each training seed, a column for each rollout (task, seed), or one column.
 
     Returns:
         difference (the mean), low, high, p_value (of a mean of 0), df, and visible: the smallest mean that would be
@@ -263,17 +265,17 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
     Raises:
         ValueError: fewer than two training seeds.
     """
-    seeds, attempts = values.shape
+    seeds, rollouts = values.shape
     if seeds < 2:
         raise ValueError(f"training seeds={list(values.index)}: give at least 2, or nothing is known of their spread")
     array = values.to_numpy(float)
-    mean, by_seed, by_attempt = array.mean(), array.mean(axis=1), array.mean(axis=0)
+    mean, by_seed, by_rollout = array.mean(), array.mean(axis=1), array.mean(axis=0)
     tasks = values.columns.get_level_values(0)
-    of_task = pd.Series(by_attempt).groupby(np.asarray(tasks)).transform("mean").to_numpy()
-    freedom = np.array([seeds - 1, attempts - tasks.nunique(), (seeds - 1) * (attempts - 1)])
+    of_task = pd.Series(by_rollout).groupby(np.asarray(tasks)).transform("mean").to_numpy()
+    freedom = np.array([seeds - 1, rollouts - tasks.nunique(), (seeds - 1) * (rollouts - 1)])
     squares = np.array([
-        attempts * np.square(by_seed - mean).sum(), seeds * np.square(by_attempt - of_task).sum(),
-        np.square(array - by_seed[:, None] - by_attempt + mean).sum(),
+        rollouts * np.square(by_seed - mean).sum(), seeds * np.square(by_rollout - of_task).sum(),
+        np.square(array - by_seed[:, None] - by_rollout + mean).sum(),
     ])  # fmt: skip
     parts = np.divide(squares, freedom, out=np.zeros(3), where=freedom > 0)
     variance = max(parts[0] + parts[1] - parts[2], parts[2] / 2)  # an estimate near or below 0 is chance
@@ -290,7 +292,7 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
 def crossed_bootstrap(
     values: pd.DataFrame, *, seed: int, confidence: float = CONFIDENCE, resamples: int = 2000
 ) -> tuple[float, float]:
-    """Percentile interval of the mean from drawing training seeds, and attempts within tasks (Owen 2007).
+    """Percentile interval of the mean from drawing training seeds, and rollouts within tasks (Owen 2007).
 
     With 5 training seeds it does not keep its word, so `over_seeds` is what is reported and this stands beside it:
     simulated, it contains a known truth 99 % of the time where seeds are alike and 93 % where they differ much; the
@@ -299,10 +301,10 @@ def crossed_bootstrap(
     Source: the pigeonhole bootstrap, doi 10.1214/07-AOAS122: lines and columns are drawn apart from each other.
     """
     rng, array = np.random.default_rng(seed), values.to_numpy(float)
-    seeds, attempts = array.shape
+    seeds, rollouts = array.shape
     lines = rng.multinomial(seeds, np.full(seeds, 1 / seeds), resamples)
     tasks = np.asarray(values.columns.get_level_values(0))
-    columns = np.zeros((resamples, attempts), dtype=int)
+    columns = np.zeros((resamples, rollouts), dtype=int)
     for task in np.unique(tasks):
         places = np.flatnonzero(tasks == task)
         columns[:, places] = rng.multinomial(len(places), np.full(len(places), 1 / len(places)), resamples)

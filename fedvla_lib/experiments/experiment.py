@@ -1,24 +1,24 @@
-"""A grid of arms, partitions and seeds from one small file, one run folder a cell, resumable.
+"""A grid of methods, partitions and seeds from one small file, one run folder a cell, resumable.
 
 ::
 
     profile = "laptop"          # settings that no cell names
     seeds = [0, 1, 2]           # a seed fixes the partition, the clients drawn, batches and noise
-    rollouts = 50               # attempts at each task for each cell; for kind "clients", of each client
+    rollouts = 50               # rollouts at each task for each cell; for kind "clients", of each client
     first_rollout_seed = 2_000_000
 
     [settings]                  # of every cell
     local_steps = 20
 
-    [partitions.by_task]        # every arm runs on every partition
+    [partitions.by_task]        # every method runs on every partition
     partition = "task"
 
-    [arms.fedavg]               # a kind of training, and settings of its own
-    kind = "federated"          # or base, centralized, local-only: every client for itself, the attempts dealt out
+    [methods.fedavg]               # a kind of training, and settings of its own
+    kind = "federated"          # or base, centralized, local-only: every client for itself, the rollouts dealt out
                                 # over them; or clients: what each ends with, on its own tasks
 
     [[only]]                    # if there are any: cells that match none of them are left out
-    arm = "fedavg"
+    method = "fedavg"
     partition = "by_task"
 """
 
@@ -46,7 +46,7 @@ from fedvla_lib.run_folder import GLOBAL, RunFolder
 class Measured:
     """What training and evaluating a cell brought."""
 
-    rows: list[dict[str, Any]]  # the attempts
+    rows: list[dict[str, Any]]  # the rollouts
     held_out: dict[str, float]  # averages over held-out frames, and num_examples
     episodes: list[dict[str, float]] = field(default_factory=list)  # the same, of each held-out episode
     rounds: list[dict[str, Any]] = field(default_factory=list)  # events of a federated run before its last round
@@ -74,7 +74,7 @@ def measure_cell(cell: Cell, seeds: Sequence[int], out: Path) -> float:
     stamp = provenance.first_stamp(cell.config, cell.kind)
     found = MEASURES[cell.kind](config, seeds)
     steps = sum(of_model["in_all"] for of_model in found.steps.values())
-    known = {"arm": cell.arm, "kind": cell.kind, "partition": cell.partition, "steps": found.steps,
+    known = {"method": cell.method, "kind": cell.kind, "partition": cell.partition, "steps": found.steps,
              "gradient_steps": steps, "samples": steps * config.batch_size, "bytes": found.bytes,
              "train_s": found.train_s}  # fmt: skip
     ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": methods.trained_by()}
@@ -129,7 +129,7 @@ def _travelled(folder: Path) -> int:
 
 
 def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
-    """Measure every client's own model: all held-out episodes for each, the attempts dealt out over them."""
+    """Measure every client's own model: all held-out episodes for each, the rollouts dealt out over them."""
     each, steps, seconds = [], {}, 0.0
     for client in range(config.num_clients):
         began = time.perf_counter()

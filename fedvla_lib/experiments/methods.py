@@ -32,7 +32,7 @@ STEPS_FILE = "steps.json"  # beside the weights of a model in the cache: the ste
 
 
 def total_steps(config: Config) -> int:
-    """Gradient steps that a federated run asks of all clients together: what the centralized arm may spend."""
+    """Gradient steps that a federated run asks of all clients together: what the centralized method may spend."""
     return steps_in_a_row(config) * draw_size(config.fraction_train, config.num_clients)
 
 
@@ -63,7 +63,7 @@ def federated_policy(config: Config) -> model.Bundle:
 
 
 def base(config: Config) -> model.Bundle:
-    """Return the model every arm starts from, with the normalisation of the pooled training episodes."""
+    """Return the model every method starts from, with the normalisation of the pooled training episodes."""
     pooled = normalisation.common_statistics(config, open_pooled(config).statistics())
     return model.load_policy(config, pooled)
 
@@ -118,7 +118,7 @@ def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **how: Any)
 
 
 def _kept(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
-    """Load the arm's model from the cache, or train and keep it."""
+    """Load the method's model from the cache, or train and keep it."""
     folder = _place(config, name)
     with _alone(folder):
         if not folder.exists():
@@ -134,7 +134,7 @@ def _keep(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
 
 
 def _place(config: Config, name: str) -> Path:
-    return cache_dir() / "arms" / f"{name}-{_key(config)}"
+    return cache_dir() / "methods" / f"{name}-{_key(config)}"
 
 
 def _alone(kept: Path) -> FileLock:

@@ -11,9 +11,9 @@ from fedvla_lib.config import Config, from_profile
 from fedvla_lib.evaluation.rollouts import rollout_seeds
 
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
-NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "arms", "only"}
+NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "methods", "only"}
 KINDS = ("base", "federated", "centralized", "local-only", "clients")  # of training, and of what is measured of it
-RULES = ("arm", "partition", "seed", "kind")  # what a rule under [[only]] may name
+RULES = ("method", "partition", "seed", "kind")  # what a rule under [[only]] may name
 # A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
 QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_rollouts": 0, "checkpoint_every": 0}
 
@@ -22,7 +22,7 @@ QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_
 class Cell:
     """One training and its evaluation."""
 
-    arm: str
+    method: str
     kind: str
     partition: str
     seed: int
@@ -31,7 +31,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of the cell's folder."""
-        return f"{self.partition}_{self.arm}_{self.seed}"
+        return f"{self.partition}_{self.method}_{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ def read_plan(file: Path) -> Plan:
         told = tomllib.loads(Path(file).read_text())
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{file}: {error}") from error
-    for name in ("arms", "partitions", "seeds", "rollouts"):
+    for name in ("methods", "partitions", "seeds", "rollouts"):
         if not told.get(name):
-            raise ValueError(f"{file} lacks {name!r}: give one of each of arms, partitions, seeds and rollouts")
+            raise ValueError(f"{file} lacks {name!r}: give one of each of methods, partitions, seeds and rollouts")
     if unknown := sorted(set(told) - NAMES):
         raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
     _check_types(told, Path(file))
@@ -70,7 +70,7 @@ def _check_types(told: dict[str, Any], file: Path) -> None:
         "rollouts": (type(told["rollouts"]) is int and told["rollouts"] > 0, "a number above 0"),
         "first_rollout_seed": (type(told.get("first_rollout_seed", 0)) is int, "a whole number"),
     }
-    for name in ("arms", "partitions"):
+    for name in ("methods", "partitions"):
         tables = told[name]
         usable[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
     usable["settings"] = (isinstance(told.get("settings", {}), dict), "a table")
@@ -85,15 +85,15 @@ def _check_types(told: dict[str, Any], file: Path) -> None:
 def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
     for seed in told["seeds"]:
         for partition, of_partition in told["partitions"].items():
-            for arm, of_arm in told["arms"].items():
-                own = dict(of_arm)
+            for method, of_method in told["methods"].items():
+                own = dict(of_method)
                 kind = own.pop("kind", "federated")
-                if bad := [name for name in (partition, arm) if not FILE_NAME.fullmatch(name)]:
+                if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
                     raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
                 if kind not in KINDS:
-                    raise ValueError(f"{file}: arm {arm!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
+                    raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
                 settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(arm, kind, partition, seed, from_profile(told.get("profile"), **settings))
+                yield Cell(method, kind, partition, seed, from_profile(told.get("profile"), **settings))
 
 
 def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:

@@ -1,4 +1,4 @@
-"""What an experiment left on disk -> tables: every attempt, every measured round, arms, differences of arms."""
+"""What an experiment left on disk -> tables: every rollout, every measured round, methods, differences of methods."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,8 +11,8 @@ from fedvla_lib.config import Config
 from fedvla_lib.evaluation import statistics
 from fedvla_lib.run_folder import GLOBAL
 
-OF_CELL = ("arm", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
-OF_RUN = ("partition", "arm", "run")
+OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
+OF_RUN = ("partition", "method", "run")
 # Settings that decide what demonstrations there are and which of them are held out.
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
 SIDE_BY_SIDE = ("federated", "clients")  # kinds whose clients train at the same time
@@ -22,17 +22,17 @@ P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
 
 def read_results(folder: Path) -> pd.DataFrame:
-    """Return a row for each attempt with the last model of each cell in `folder`, with what is known of the cell.
+    """Return a row for each rollout with the last model of each cell in `folder`, with what is known of the cell.
 
     train_s is NaN where a cell's stamp has no time of its training. steps_in_all and steps_in_a_row are the gradient
-    steps of the model that made the attempt. Where `counted` is True it counted them while it trained; cells of before
+    steps of the model that made the rollout. Where `counted` is True it counted them while it trained; cells of before
     models counted have no counts, and there the numbers follow from the settings: of clients that trained alone, each
     has its share of the total.
 
     Raises:
         ValueError: there is no result.
     """
-    return pd.concat([_attempts(cell) for cell in _cells(folder)], ignore_index=True)
+    return pd.concat([_rollouts(cell) for cell in _cells(folder)], ignore_index=True)
 
 
 def _cells(folder: Path) -> Iterator[Path]:
@@ -48,7 +48,7 @@ def _known(cell: Path) -> dict[str, Any]:
     return known | {"train_s": float("nan") if known["train_s"] is None else known["train_s"]}
 
 
-def _attempts(cell: Path) -> pd.DataFrame:
+def _rollouts(cell: Path) -> pd.DataFrame:
     rows = run_folder.read_metrics(cell, "rollout")
     last = run_folder.read_metrics(cell, "evaluate").iloc[-1]
     measured = {name: float(last.get(name, "nan")) for name in HELD_OUT}
@@ -60,7 +60,7 @@ def _attempts(cell: Path) -> pd.DataFrame:
 
 
 def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
-    """Columns counted, steps_in_all and steps_in_a_row: of the model that made each attempt."""
+    """Columns counted, steps_in_all and steps_in_a_row: of the model that made each rollout."""
     counted = stamp.get("steps")
     each = counted or {GLOBAL: _planned(stamp, config)}
     alone = rows.client.map("client_{:.0f}".format) if "client" in rows else pd.Series(GLOBAL, rows.index)
@@ -81,9 +81,9 @@ def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
 def read_rounds(folder: Path) -> pd.DataFrame:
     """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
 
-    Columns: partition, arm, run, round, steps (gradient steps of all clients up to there), loss, action_error, n,
-    successes, success_rate. Rounds that made no attempt have n = 0 and no rate. The last round was
-    measured with the attempts of `read_results`, earlier ones with those of the training itself.
+    Columns: partition, method, run, round, steps (gradient steps of all clients up to there), loss, action_error, n,
+    successes, success_rate. Rounds that made no rollout have n = 0 and no rate. The last round was
+    measured with the rollouts of `read_results`, earlier ones with those of the training itself.
 
     Raises:
         ValueError: there is no result, or none of a federated cell.
@@ -104,22 +104,22 @@ def read_rounds(folder: Path) -> pd.DataFrame:
     return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
 
 
-def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.DataFrame:
-    """Return a line for each group: seeds, attempts, success with its interval, and what training took on average.
+def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> pd.DataFrame:
+    """Return a line for each group: seeds, rollouts, success with its interval, and what training took on average.
 
     steps_in_all and steps_in_a_row are those of one model; gradient_steps, samples, MB and train_s those of all models
     of a cell together, which are several where clients train alone.
 
     Args:
         rows: of `read_results`.
-        by: columns that make a group; at least partition and arm.
+        by: columns that make a group; at least partition and method.
     """
     lines = []
     for group, part in rows.groupby(list(by), sort=False):
         cells = part.groupby("run").first()
         low, high = statistics.success_interval(part)
         lines.append({
-            **dict(zip(by, group, strict=True)), "seeds": len(cells), "attempts": len(part),
+            **dict(zip(by, group, strict=True)), "seeds": len(cells), "rollouts": len(part),
             "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
             "action_error": cells.action_error.mean(),
             "steps_in_all": part.steps_in_all.mean(), "steps_in_a_row": part.steps_in_a_row.mean(),
@@ -130,20 +130,20 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "arm")) -> pd.
 
 
 def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
-    """Return a line for each partition and pair of arms that both have: `compare.difference_over_seeds` of success.
+    """Return a line for each partition and pair of methods that both have: `compare.difference_over_seeds` of success.
 
-    Only training seeds that both arms have are used. `loss` and `action_error` are differences of held-out averages,
+    Only training seeds that both methods have are used. `loss` and `action_error` are differences of held-out averages,
     with loss_low, loss_high and so on: Student's over training seeds. P-values come last; those of the table are one
     family, and `p_holm` are Holm's (1979).
     """
     lines = []
     for partition, part in rows.groupby("partition", sort=False):
-        for arm, other in pairs:
-            shared = set(part[part.arm == arm].run) & set(part[part.arm == other].run)
+        for method, other in pairs:
+            shared = set(part[part.method == method].run) & set(part[part.method == other].run)
             if len(shared) > 1:
                 both = part[part.run.isin(shared)]
-                found = statistics.difference_over_seeds(both, arm, other, seed=seed)
-                lines.append({"partition": partition, "seeds": len(shared), **found, **_held_out(both, arm, other)})
+                found = statistics.difference_over_seeds(both, method, other, seed=seed)
+                lines.append({"partition": partition, "seeds": len(shared), **found, **_held_out(both, method, other)})
     if not lines:
         return pd.DataFrame()
     table = pd.DataFrame(lines)
@@ -151,10 +151,10 @@ def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: i
     return table[[name for name in table if name not in P_VALUES] + P_VALUES]
 
 
-def _held_out(rows: pd.DataFrame, arm: str, other: str) -> dict[str, float]:
+def _held_out(rows: pd.DataFrame, method: str, other: str) -> dict[str, float]:
     found = {}
     for name in HELD_OUT:
-        each = rows.groupby(["arm", "run"])[name].first()
-        over = statistics.over_seeds((each[arm] - each[other]).to_frame())
+        each = rows.groupby(["method", "run"])[name].first()
+        over = statistics.over_seeds((each[method] - each[other]).to_frame())
         found |= {name: over["difference"], f"{name}_low": over["low"], f"{name}_high": over["high"]}
     return found

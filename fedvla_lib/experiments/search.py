@@ -28,7 +28,7 @@ from fedvla_lib.files import write_json
 from fedvla_lib.policy.model import Bundle
 
 # Not those of chapters; of the stored experiments comparison.toml and normalisation.toml have the same. Trials make no
-# attempts, so none has chosen by them.
+# rollouts, so none has chosen by them.
 ROLLOUTS_FROM = 3_000_000
 LOCAL_STEPS = (1, 2, 5, 10, 20)
 # A client whose loss is not finite raises, and the server gives up when too few replies can be used.
@@ -42,7 +42,7 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
     Args:
         config: where the search starts; its total of gradient steps is the budget of each trial.
         trials: how many settings to try, those of earlier calls with the same `out` included.
-        rollouts: attempts at each task when the winner is measured.
+        rollouts: rollouts at each task when the winner is measured.
         out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
 
     A trial that diverges counts as one of them, with no loss.

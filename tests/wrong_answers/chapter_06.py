@@ -1,4 +1,4 @@
-"""Mistakes that readers make in the chapter that compares arms, and a word of the hint that each gets."""
+"""Mistakes that readers make in the chapter that compares methods, and a word of the hint that each gets."""
 
 STEPS = """def steps_spent(rounds, drawn, num_clients, local_steps):
     total = rounds * drawn * local_steps
@@ -30,11 +30,11 @@ PARTS = """import numpy as np
 
 
 def error_over_seeds(values):
-    seeds, attempts = values.shape
-    of_seeds = attempts * values.mean(axis=1).var(ddof=1)
-    of_attempts = seeds * values.mean(axis=0).var(ddof=1)
+    seeds, rollouts = values.shape
+    of_seeds = rollouts * values.mean(axis=1).var(ddof=1)
+    of_rollouts = seeds * values.mean(axis=0).var(ddof=1)
     left = values - values.mean(axis=1, keepdims=True) - values.mean(axis=0) + values.mean()
-    rest = (left**2).sum() / ((seeds - 1) * (attempts - 1))
+    rest = (left**2).sum() / ((seeds - 1) * (rollouts - 1))
     return {error}
 """
 
@@ -70,7 +70,7 @@ WRONG = {
     "two_errors": [
         (ERRORS.format(errors="np.array([apart, apart]) / n**0.5"), "ignores the pairs"),
         (ERRORS.format(errors="apart / n**0.5, pairs / n**0.5"), "swapped"),
-        (ERRORS.format(errors="pairs, apart"), "one attempt"),
+        (ERRORS.format(errors="pairs, apart"), "one rollout"),
         (ERRORS.format(errors="pairs / n, apart / n"), "over the root of n"),
         (ERRORS.format(errors="pairs / n**0.5, (left.std() + right.std()) / n**0.5"), "variances"),
         (ERRORS.format(errors="pairs / n**0.5"), "Two numbers"),
@@ -95,12 +95,12 @@ WRONG = {
         (NEEDED.format(needed="int(np.ceil((196 / points) ** 2 * (only_left + only_right) / n))"), "Solve"),
     ],
     "error_over_seeds": [
-        (PARTS.format(error="values.std() / values.size**0.5"), "counts every attempt"),
+        (PARTS.format(error="values.std() / values.size**0.5"), "counts every rollout"),
         (PARTS.format(error="values.mean(axis=1).std(ddof=1) / seeds**0.5"), "same positions"),
-        (PARTS.format(error="np.sqrt((of_seeds + of_attempts) / values.size)"), "take it off"),
-        (PARTS.format(error="(of_seeds + of_attempts - rest) / values.size"), "take the root"),
+        (PARTS.format(error="np.sqrt((of_seeds + of_rollouts) / values.size)"), "take it off"),
+        (PARTS.format(error="(of_seeds + of_rollouts - rest) / values.size"), "take the root"),
         (
-            PARTS.format(error="np.sqrt((of_seeds + of_attempts - (left**2).mean()) / values.size)"),
+            PARTS.format(error="np.sqrt((of_seeds + of_rollouts - (left**2).mean()) / values.size)"),
             "degrees of freedom",
         ),
         (PARTS.format(error="values.std(axis=0)"), "One number"),

@@ -26,35 +26,37 @@ def steps_spent(steps: Callable[[int, int, int, int], Sequence[int]]) -> None:
 
 
 def unpaired(find: Callable[[Sequence, Sequence], Sequence]) -> None:
-    """``find(left, right)`` lists the (task, seed) that one of two arms attempted alone."""
+    """``find(left, right)`` lists the (task, seed) that one of two methods attempted alone."""
     left = [("lift", 1), ("lift", 2), ("push", 1), ("push", 3)]
     right = [("lift", 2), ("lift", 1), ("push", 2), ("push", 1)]
     given = list(find(list(left), list(right)))
-    pairs = all(isinstance(attempt, tuple | list) and len(attempt) == 2 for attempt in given)
-    expect(pairs, "An attempt is a task and a seed: the same seed in another task is another attempt.")
-    found = {tuple(attempt) for attempt in given}
-    expect(found, "As many attempts and the same tasks are not enough: look at each (task, seed).")
+    pairs = all(isinstance(rollout, tuple | list) and len(rollout) == 2 for rollout in given)
+    expect(pairs, "An rollout is a task and a seed: the same seed in another task is another rollout.")
+    found = {tuple(rollout) for rollout in given}
+    expect(found, "As many rollouts and the same tasks are not enough: look at each (task, seed).")
     shared = {("lift", 1), ("lift", 2), ("push", 1)}
-    expect(not found & shared, "Both arms made an attempt that you list: the order they made them in is no matter.")
-    expect(len(found) == 2, "Look from both sides: what only the left arm made, and what only the right arm made.")
-    expect(not list(find(left, left[::-1])), "The same attempts in another order can all be paired.")
+    expect(not found & shared, "Both methods made an rollout that you list: the order they made them in is no matter.")
+    expect(
+        len(found) == 2, "Look from both sides: what only the left method made, and what only the right method made."
+    )
+    expect(not list(find(left, left[::-1])), "The same rollouts in another order can all be paired.")
     more = find(left, [*left, ("stack", 7)])
-    expect([tuple(attempt) for attempt in more] == [("stack", 7)], "An arm may also have made more than the other.")
+    expect([tuple(rollout) for rollout in more] == [("stack", 7)], "An method may also have made more than the other.")
 
 
 def two_errors(errors: Callable[[np.ndarray, np.ndarray], tuple[float, float]]) -> None:
     """``errors(left, right)``: standard errors of the difference in success, from pairs and as if there were none."""
     rng = np.random.default_rng(6)
     for noise in (0.3, 1.0):
-        ease = rng.normal(size=400)  # of the starting position, for both arms
+        ease = rng.normal(size=400)  # of the starting position, for both methods
         left, right = (1 * (ease + shift > noise * rng.normal(size=400)) for shift in (0.2, -0.1))
         given, root = errors(left, right), np.sqrt(len(left))
         expect(np.shape(given) == (2,), "Two numbers are wanted: from pairs, then as if there were none.")
         together, apart = (left - right).std() / root, np.hypot(left.std(), right.std()) / root
-        expect(not _near(given[0], together * root), "That is the spread of one attempt, not the error of a mean.")
+        expect(not _near(given[0], together * root), "That is the spread of one rollout, not the error of a mean.")
         swapped = _near(given[0], apart) and _near(given[1], together)
         expect(not swapped, "The two are swapped: the one from pairs first.")
-        expect(not _near(given[0], apart), "The first one ignores the pairs: subtract attempt by attempt first.")
+        expect(not _near(given[0], apart), "The first one ignores the pairs: subtract rollout by rollout first.")
         expect(_near(given[0], together), "The first is the spread of the differences over the root of n.")
         expect(_near(given[1], apart), "For the second, the variances of both success rates add up.")
 
@@ -87,28 +89,30 @@ def pairs_needed(needed: Callable[[float, int, int, int], int]) -> None:
         expect(given > 2, "Points are hundredths: a difference of 5 points is 0.05.")
         expect(not close(given, right * n, 0.01), "The share of discordant pairs is wanted, not their number.")
         lead = abs(only_left - only_right) / (only_left + only_right)
-        expect(not close(given, right * lead, 0.01), "Both kinds of discordant pairs count, whichever arm they favour.")
+        expect(
+            not close(given, right * lead, 0.01), "Both kinds of discordant pairs count, whichever method they favour."
+        )
         expect(not close(given, right / discordant, 0.01), "Pairs that agree tell nothing: use the discordant share.")
         expect(close(given, right, 0.01), f"Solve {share} = 2.8 √(δ/n) for n, with δ = {discordant:g}.")
         expect(given >= right and float(given).is_integer(), "There is no part of a pair: round up.")
 
 
 def error_over_seeds(error: Callable[[np.ndarray], float]) -> None:
-    """``error(values)``, training seeds x attempts, is the standard error of the mean for others of both."""
+    """``error(values)``, training seeds x rollouts, is the standard error of the mean for others of both."""
     rng = np.random.default_rng(7)
-    for seeds, attempts, luck in ((5, 60, 0.25), (3, 40, 0.4)):
-        by_seed, by_attempt = luck * rng.normal(size=(seeds, 1)), 0.5 * rng.normal(size=attempts)
-        values = by_seed + by_attempt + 0.5 * rng.normal(size=(seeds, attempts))
+    for seeds, rollouts, luck in ((5, 60, 0.25), (3, 40, 0.4)):
+        by_seed, by_rollout = luck * rng.normal(size=(seeds, 1)), 0.5 * rng.normal(size=rollouts)
+        values = by_seed + by_rollout + 0.5 * rng.normal(size=(seeds, rollouts))
         given = error(values)
         expect(np.shape(given) == (), "One number is wanted.")
-        of_seeds = attempts * values.mean(axis=1).var(ddof=1)
-        of_attempts = seeds * values.mean(axis=0).var(ddof=1)
-        both = (seeds - 1) * of_seeds + (attempts - 1) * of_attempts
-        rest = (values.var() * values.size - both) / ((seeds - 1) * (attempts - 1))
-        right = (of_seeds + of_attempts - rest) / values.size
+        of_seeds = rollouts * values.mean(axis=1).var(ddof=1)
+        of_rollouts = seeds * values.mean(axis=0).var(ddof=1)
+        both = (seeds - 1) * of_seeds + (rollouts - 1) * of_rollouts
+        rest = (values.var() * values.size - both) / ((seeds - 1) * (rollouts - 1))
+        right = (of_seeds + of_rollouts - rest) / values.size
         flat = values.std() / np.sqrt(values.size)
-        expect(not _near(given, flat), "That counts every attempt as independent: those of a seed are not.")
+        expect(not _near(given, flat), "That counts every rollout as independent: those of a seed are not.")
         expect(not close(given, np.sqrt(of_seeds / values.size)), "That is for other seeds at these same positions.")
         expect(not close(given, right), "That is the variance: take the root.")
-        expect(not close(given**2, (of_seeds + of_attempts) / values.size), "The rest is in both parts: take it off.")
+        expect(not close(given**2, (of_seeds + of_rollouts) / values.size), "The rest is in both parts: take it off.")
         expect(close(given, np.sqrt(right)), "Look at the degrees of freedom: S - 1, n - 1, and their product.")

@@ -12,7 +12,7 @@ from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
 def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
-    """Draw a table as bars: a group per row, a colour per column; an arm keeps its colour."""
+    """Draw a table as bars: a group per row, a colour per column; an method keeps its colour."""
     ax = ax or new_axes()
     width = 0.8 / table.shape[1]
     for i, name in enumerate(table.columns):
@@ -27,13 +27,13 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
 
 
 def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point an arm: held-out loss across, success rate up; columns arm, loss, success_rate, low, high."""
+    """Draw one point an method: held-out loss across, success rate up; columns method, loss, success_rate, low, high."""
     ax = ax or new_axes()
     for i, point in enumerate(table.itertuples()):
-        color = method_color(point.arm, i)
+        color = method_color(point.method, i)
         error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
-        ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.arm)
-    ax.set_xscale("log")  # the start may lie many times above the trained arms
+        ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.method)
+    ax.set_xscale("log")  # the start may lie many times above the trained methods
     ax.set_xlim(table.loss.min() / 1.4, 1.4 * table.loss.max())
     ax.xaxis.set_major_locator(plt.LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     ax.xaxis.set_major_formatter(lambda loss, _: f"{loss:g}")
@@ -46,7 +46,7 @@ def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
 
 
 def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw differences in success rate with their intervals, a line each; columns arm, other, difference, low, high."""
+    """Draw differences in success rate with their intervals, a line each; columns method, other, difference, low, high."""
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, max(3.6, 1.2 + 0.4 * len(table))), layout="constrained")
     places = np.arange(len(table))
@@ -55,20 +55,20 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.axvline(0, color="#555555", linewidth=1)
     reach = max(20, 105 * table[["low", "high"]].abs().to_numpy().max())
     ax.set_xlim(-reach, reach)
-    ax.set_yticks(places, table.arm + " − " + table.other)
+    ax.set_yticks(places, table.method + " − " + table.other)
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("difference in success rate [points], 95 % interval")
-    ax.set_ylabel("pair of arms")
+    ax.set_ylabel("pair of methods")
     return ax
 
 
 def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw differences in success of one arm to others, a panel for each other arm, a row for each partition.
+    """Draw differences in success of one method to others, a panel for each other method, a row for each partition.
 
-    Each panel has its own scale: what separates an arm from its rival is small beside what separates it from a bad one.
+    Each panel has its own scale: what separates an method from its rival is small beside what separates it from a bad one.
 
     Args:
-        table: columns partition, arm, other, difference, low, high; the same arm in all lines.
+        table: columns partition, method, other, difference, low, high; the same method in all lines.
     """
     others, partitions = list(dict.fromkeys(table.other)), list(dict.fromkeys(table.partition))
     if axes is None:
@@ -81,7 +81,7 @@ def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None
         errors = 100 * np.abs(np.stack([part.difference - part.low, part.high - part.difference]))
         ax.errorbar(100 * part.difference, rows, xerr=errors, fmt="o", capsize=4, color=method_color(other))
         ax.axvline(0, color="#555555", linewidth=1)
-        ax.set_title(f"{table.arm.iloc[0]}\n− {other}", fontsize=10)
+        ax.set_title(f"{table.method.iloc[0]}\n− {other}", fontsize=10)
         ax.set_xlabel("difference [points],\n95 % interval")
     axes[0].set_yticks(range(len(partitions)), partitions)
     axes[0].set_ylim(len(partitions) - 0.5, -0.5)
@@ -92,7 +92,7 @@ def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None
 def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
     """Draw each column of a table against its index; a column named ``optimum`` is a dotted line.
 
-    Columns of one colour, such as two runs of one arm, differ by their dashes.
+    Columns of one colour, such as two runs of one method, differ by their dashes.
     """
     ax = ax or new_axes()
     colors = [_column_color(str(name), i) for i, name in enumerate(table.columns)]
@@ -107,24 +107,24 @@ def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = N
 
 
 def _column_color(name: str, place: int) -> str:
-    """A client keeps its colour; other columns are arms, or take the palette in order."""
+    """A client keeps its colour; other columns are methods, or take the palette in order."""
     kind, _, number = name.partition(" ")
     return client_color(int(number)) if kind == "client" and number.isdigit() else method_color(name, place)
 
 
 def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw held-out loss and success against gradient steps, an arm a colour: mean and range over training seeds.
+    """Draw held-out loss and success against gradient steps, an method a colour: mean and range over training seeds.
 
     Args:
-        rounds: columns arm, run, steps, loss, success_rate (NaN: not measured).
+        rounds: columns method, run, steps, loss, success_rate (NaN: not measured).
     """
     if axes is None:
         _, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.4), layout="constrained")
-    for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
+    for i, (method, part) in enumerate(rounds.groupby("method", sort=False)):
         for ax, value in zip(axes, ("loss", "success_rate"), strict=True):
             over = part.dropna(subset=[value]).groupby("steps")[value].agg(["mean", "min", "max"])
-            ax.plot(over.index, over["mean"], "o-", color=method_color(arm, i), label=arm)
-            ax.fill_between(over.index, over["min"], over["max"], color=method_color(arm, i), alpha=0.15)
+            ax.plot(over.index, over["mean"], "o-", color=method_color(method, i), label=method)
+            ax.fill_between(over.index, over["min"], over["max"], color=method_color(method, i), alpha=0.15)
             ax.set_xlabel("gradient steps of all clients")
     axes[0].set_ylabel("held-out loss [normalised units²]")
     axes[0].set_yscale("log")
@@ -138,10 +138,10 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
 
 
 def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point a checkpoint: held-out loss across, success rate up, an arm a colour; columns as above."""
+    """Draw one point a checkpoint: held-out loss across, success rate up, an method a colour; columns as above."""
     ax = ax or new_axes()
-    for i, (arm, part) in enumerate(rounds.groupby("arm", sort=False)):
-        ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=method_color(arm, i), label=arm)
+    for i, (method, part) in enumerate(rounds.groupby("method", sort=False)):
+        ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=method_color(method, i), label=method)
     ax.set_ylim(-0.02, 1.02)
     ax.set_xlabel("held-out loss [normalised units²]")
     ax.set_ylabel("success rate")

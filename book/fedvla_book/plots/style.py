@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH
 
 METHOD_COLORS = {"base": "#7F7F7F", "local-only": "#E69F00", "federated": "#0072B2", "centralized": "#009E73"}
-METHOD_FAMILIES = {  # what a stored arm's name begins with -> its colour; a cadence or an addition follows the name
+METHOD_FAMILIES = {  # what a stored method's name begins with -> its colour; a cadence or an addition follows the name
     **METHOD_COLORS,
     "fedavg": METHOD_COLORS["federated"],
     "fedavg-10x4x20": "#56B4E9",
@@ -43,9 +43,9 @@ def use_style() -> None:
     plt.rcParams.update(STYLE)
 
 
-def method_color(arm: str, other: int = 0) -> str:
-    """Return the colour of an arm throughout the book; one without its own takes number `other` of the palette."""
-    name = arm.lower().replace(", ", "-") + "-"
+def method_color(method: str, other: int = 0) -> str:
+    """Return the colour of an method throughout the book; one without its own takes number `other` of the palette."""
+    name = method.lower().replace(", ", "-") + "-"
     own = [color for family, color in METHOD_FAMILIES.items() if name.startswith(f"{family}-")]
     return own[-1] if own else PALETTE[other % len(PALETTE)]
 

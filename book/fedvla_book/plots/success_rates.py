@@ -10,20 +10,22 @@ from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
 def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success rates with their intervals; columns arm, task, success_rate, low, high."""
+    """Draw success rates with their intervals; columns method, task, success_rate, low, high."""
     ax = ax or new_axes()
-    arms, tasks = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.task))
-    width = 0.8 / len(arms)
-    for i, arm in enumerate(arms):
-        part = table[table.arm == arm].set_index("task").loc[tasks]
+    methods, tasks = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.task))
+    width = 0.8 / len(methods)
+    for i, method in enumerate(methods):
+        part = table[table.method == method].set_index("task").loc[tasks]
         errors = np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
-        place = np.arange(len(tasks)) + (i - (len(arms) - 1) / 2) * width
-        ax.bar(place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=arm, color=method_color(arm, i))
+        place = np.arange(len(tasks)) + (i - (len(methods) - 1) / 2) * width
+        ax.bar(
+            place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=method, color=method_color(method, i)
+        )
     ax.set_xticks(range(len(tasks)), tasks)
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("task")
     ax.set_ylabel("success rate (95 % interval)")
-    ax.legend(frameon=False, ncols=len(arms), loc="upper center", bbox_to_anchor=(0.5, 1.14))
+    ax.legend(frameon=False, ncols=len(methods), loc="upper center", bbox_to_anchor=(0.5, 1.14))
     return ax
 
 
@@ -76,26 +78,26 @@ def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes | None = None) -> Axes:
-    """Draw a success rate with its interval for each line; columns arm, partition, success_rate, low, high.
+    """Draw a success rate with its interval for each line; columns method, partition, success_rate, low, high.
 
-    A partition has a colour and a place within the arm's row, so that arms can be compared in each.
+    A partition has a colour and a place within the method's row, so that methods can be compared in each.
     """
-    arms, partitions = list(dict.fromkeys(table.arm)), list(dict.fromkeys(table.partition))
+    methods, partitions = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.partition))
     if ax is None:
-        _, ax = plt.subplots(figsize=(WIDTH, 1.2 + 0.3 * len(arms) + 0.1 * len(table)), layout="constrained")
+        _, ax = plt.subplots(figsize=(WIDTH, 1.2 + 0.3 * len(methods) + 0.1 * len(table)), layout="constrained")
     for i, partition in enumerate(partitions):
         part = table[table.partition == partition]
-        rows = np.array([arms.index(arm) for arm in part.arm]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
+        rows = np.array([methods.index(method) for method in part.method]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
         errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
-        if len(partitions) == 1:  # then the colours are the arms'
-            for row, rate, error, arm in zip(rows, 100 * part.success_rate, errors.T, part.arm, strict=True):
-                look = {"fmt": "o", "capsize": 3, "color": method_color(arm, int(row))}
+        if len(partitions) == 1:  # then the colours are the methods'
+            for row, rate, error, method in zip(rows, 100 * part.success_rate, errors.T, part.method, strict=True):
+                look = {"fmt": "o", "capsize": 3, "color": method_color(method, int(row))}
                 ax.errorbar(rate, row, xerr=error[:, None], **look)
             continue
         color = PALETTE[i % len(PALETTE)]
         ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
-    ax.set_yticks(range(len(arms)), arms)
-    ax.set_ylim(len(arms) - 0.5, -0.5)
+    ax.set_yticks(range(len(methods)), methods)
+    ax.set_ylim(len(methods) - 0.5, -0.5)
     ax.set_xlim(-2, 102)
     ax.set_xlabel("success rate [%], 95 % interval")
     ax.set_ylabel(ylabel)
@@ -106,7 +108,7 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
 
 
 def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success against what travelled, a labelled point a line; columns arm, MB, success_rate, low, high.
+    """Draw success against what travelled, a labelled point a line; columns method, MB, success_rate, low, high.
 
     Points of equal MB would hide each other: they stand side by side, around their place.
     """
@@ -117,8 +119,8 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     places = table.MB * 1.08 ** (alike - middle)
     for i, (place, row) in enumerate(zip(places, table.itertuples(), strict=True)):
         errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
-        color, marker = method_color(row.arm, i), "osD^vP*X"[(i + i // 8) % 8]
-        ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.arm)
+        color, marker = method_color(row.method, i), "osD^vP*X"[(i + i // 8) % 8]
+        ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.method)
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
     ax.set_xlabel("everything that travelled [MB], equals side by side")
@@ -128,7 +130,7 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw points of success for each megabyte that travelled, a bar an arm; columns arm, MB, success_rate, low, high.
+    """Draw points of success for each megabyte that travelled, a bar an method; columns method, MB, success_rate, low, high.
 
     The interval is that of the success rate, divided by the bytes, which are known exactly.
     """
@@ -138,7 +140,7 @@ def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
     errors = np.stack([points["success_rate"] - points["low"], points["high"] - points["success_rate"]])
     places = np.arange(len(table))
     ax.barh(places, points["success_rate"], xerr=np.abs(errors), capsize=3, color=PALETTE[0])
-    ax.set_yticks(places, table.arm)
+    ax.set_yticks(places, table.method)
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("success rate for what travelled [points per MB], 95 % interval")
     ax.set_ylabel("what travels")

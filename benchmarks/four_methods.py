@@ -1,10 +1,10 @@
-"""Federated, centralized and every client alone, on the same attempts, over several seeds.
+"""Federated, centralized and every client alone, on the same rollouts, over several seeds.
 
 A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are the same ones. The best client
-of a run is chosen by these very attempts, which favours it. A client alone takes its share of the steps, so
+of a run is chosen by these very rollouts, which favours it. A client alone takes its share of the steps, so
 these rates say what it gets for an equal total, not what it can do. Finished seeds are kept and not measured again.
 
-    python benchmarks/four_arms.py
+    python benchmarks/four_methods.py
 """
 
 import json
@@ -32,32 +32,32 @@ def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the runs")
-    parser.add_argument("--rollouts", type=int, default=20, help="attempts at each task, for each model and seed")
+    parser.add_argument("--rollouts", type=int, default=20, help="rollouts at each task, for each model and seed")
     parser.add_argument("--threads", type=int, default=cores(), help="threads that a model computes on")
     chosen = parser.parse_args()
     recording = recordings.resolve(laptop(chosen.profile))
     config = laptop(chosen.profile, num_threads=chosen.threads, data=str(recording))
     rows = pd.concat([one_seed(config, seed, chosen) for seed in chosen.seeds], ignore_index=True)
-    report("four_arms", summary(rows), chosen.out)
+    report("four_methods", summary(rows), chosen.out)
 
 
 def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
-    """Return a row for each attempt of each model of a run."""
+    """Return a row for each rollout of each model of a run."""
     config = replace(config, seed=seed)
     run = methods.federated(config)
-    kept = chosen.out / "four_arms" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
+    kept = chosen.out / "four_methods" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
     if not kept.is_file():
         starts = rollout_seeds(chosen.rollouts, first=STARTS_FROM)
-        rows = [row for name, bundle in models(config) for row in attempts(name, bundle, config, starts)]
+        rows = [row for name, bundle in models(config) for row in rollouts(name, bundle, config, starts)]
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_json(kept, rows)
     return pd.DataFrame(json.loads(kept.read_text())).assign(run=seed)
 
 
-def attempts(name: str, bundle: Bundle, config: Config, starts: list[int]) -> list[dict[str, object]]:
-    """Return what a table of pairs needs of each attempt of a model."""
+def rollouts(name: str, bundle: Bundle, config: Config, starts: list[int]) -> list[dict[str, object]]:
+    """Return what a table of pairs needs of each rollout of a model."""
     found = evaluate(PolicyActor(bundle, config.seed), task_names(config), starts, image_size=config.image_size)
-    return [{"arm": name, "task": row["task"], "seed": row["seed"], "success": row["success"]} for row in found]
+    return [{"method": name, "task": row["task"], "seed": row["seed"], "success": row["success"]} for row in found]
 
 
 def models(config: Config) -> Iterator[tuple[str, Bundle]]:
@@ -69,19 +69,21 @@ def models(config: Config) -> Iterator[tuple[str, Bundle]]:
 
 
 def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
-    """Return a line for each arm: successes with interval, and how far federated is ahead on the same attempts."""
-    alone = rows[rows.arm.str.endswith(" alone")]
-    best = pd.concat([part[part.arm == part.groupby("arm").success.sum().idxmax()] for _, part in alone.groupby("run")])
-    counted = {"federated": rows[rows.arm == "federated"], "centralized": rows[rows.arm == "centralized"]}
+    """Return a line for each method: successes with interval, and how far federated is ahead on the same rollouts."""
+    alone = rows[rows.method.str.endswith(" alone")]
+    best = pd.concat(
+        [part[part.method == part.groupby("method").success.sum().idxmax()] for _, part in alone.groupby("run")]
+    )
+    counted = {"federated": rows[rows.method == "federated"], "centralized": rows[rows.method == "centralized"]}
     counted |= {BEST: best, "all clients alone": alone}
     found = []
     for name, part in counted.items():
-        (line,) = success_table(part.assign(arm=name), ["arm"]).to_dict("records")
+        (line,) = success_table(part.assign(method=name), ["method"]).to_dict("records")
         found.append(
             {
-                "arm": name,
+                "method": name,
                 "runs": int(part.run.nunique()),
-                "attempts": int(line["n"]),
+                "rollouts": int(line["n"]),
                 "successes": int(line["successes"]),
                 "95 % interval [%]": f"{100 * line['low']:.0f} to {100 * line['high']:.0f}",
                 "federated ahead by [points]": ahead_of(name, counted) if name in ("centralized", BEST) else "",
@@ -92,16 +94,16 @@ def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
 
 
 def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
-    """Say how far federated is ahead of an arm, with interval; a pair is a task and a start in one run."""
-    both = pd.concat([counted["federated"], counted[name].assign(arm=name)])
+    """Say how far federated is ahead of an method, with interval; a pair is a task and a start in one run."""
+    both = pd.concat([counted["federated"], counted[name].assign(method=name)])
     paired = both.assign(task=both.run.astype(str) + both.task)
     result = paired_difference(paired, "federated", name, seed=0)
     return f"{100 * result['difference']:+.0f} ({100 * result['low']:+.0f} to {100 * result['high']:+.0f})"
 
 
 def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
-    """Say how many models of an arm succeeded less often than the federated model of their run."""
-    rates, ours = part.groupby(["run", "arm"]).success.mean(), federated.groupby("run").success.mean()
+    """Say how many models of an method succeeded less often than the federated model of their run."""
+    rates, ours = part.groupby(["run", "method"]).success.mean(), federated.groupby("run").success.mean()
     return f"{sum(rate < ours[run] for (run, _), rate in rates.items())} of {len(rates)}"
 
 
