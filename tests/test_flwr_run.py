@@ -52,7 +52,7 @@ def forget(message, context, call_next):
 
 
 def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
-    """Two rounds with all state that a client keeps between rounds: control variate, optimiser state, rounding error."""
+    """Two rounds with all that a client keeps between rounds: control variate, optimiser state, rounding error."""
     tiny = replace(tiny, num_server_rounds=2, strategy="scaffold", keep_optimizer=True, exchange="int8")
     before = PYPROJECT.read_bytes()
     root = simulation.run_simulation(tiny, timeout_s=540)
@@ -107,7 +107,8 @@ def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
     """As from a wheel: only the folder of the package."""
     package = PYPROJECT.parent / "fedvla_lib"
     alone = shutil.copytree(package, tmp_path / "site/fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
-    code = "import pathlib, sys; from fedvla_lib.engines import app_bundle as a; print(a.stage_app(pathlib.Path(sys.argv[1])))"
+    code = "import pathlib, sys; from fedvla_lib.engines import app_bundle\n"
+    code += "print(app_bundle.stage_app(pathlib.Path(sys.argv[1])))"
     environment = {**os.environ, "PYTHONPATH": str(alone.parent)}
     command = [sys.executable, "-c", code, str(tmp_path / "stage")]
     said = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
