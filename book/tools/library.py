@@ -105,7 +105,7 @@ def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
             continue
         if (own := room_of(name)) != room:
             room, told = own, _first_sentence(described.get(own, "What every room may use."))
-            parts.append(f"## {own}\n\n{told}\nIts place in the house: [](architecture.md#room-{own}).\n")
+            parts.append(f"## {own}\n\n{told}\nIts place in the house: {{ref}}`room-{own}`.\n")
         parts.append(f"### {name}\n\n```{{eval-rst}}\n.. automodule:: {PACKAGE}.{name}\n   :members:\n```\n")
     return "\n".join(parts)
 
@@ -192,5 +192,6 @@ def _box(room: str, x: float, y: float, width: float, height: float, lines: list
         f'font-weight="{weight}" xml:space="preserve">{escape(text)}</text>'
         for row, (text, size, weight) in enumerate(texts)
     )
-    frame = f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}" rx="6" fill="#f2f2f2" stroke="#444"/>'
+    size = f'x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}"'
+    frame = f'<rect {size} rx="6" fill="#f2f2f2" stroke="#444"/>'
     return f"<g>{frame}{written}</g>"
