@@ -57,4 +57,7 @@ def test_the_wheel_holds_the_model_that_labs_start_from(unpacked):
     (wheel,) = unpacked.glob("*.whl")
     files = [path for path in (ROOT / "fedvla_lib" / "nano_base").rglob("*") if path.is_file()]
     wanted = {path.relative_to(ROOT).as_posix() for path in files}
-    assert wanted and wanted <= set(ZipFile(wheel).namelist())
+    held = set(ZipFile(wheel).namelist())
+    assert wanted and wanted <= held
+    assert {"fedvla_lib/engines/connections.toml", "fedvla_lib/federation/strategies/scaffold.py"} <= held
+    assert {"fedvla_book/plots/clients.py", "fedvla_book/exercises/chapter_01.py"} <= held

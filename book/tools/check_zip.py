@@ -29,9 +29,10 @@ CELL_TIMEOUT_S = 300
 FROM_THE_WHEEL = """import sys
 from pathlib import Path
 
+import fedvla_book
 import fedvla_lib
 
-installed = Path(fedvla_lib.__file__).is_relative_to(sys.prefix)
+installed = all(Path(one.__file__).is_relative_to(sys.prefix) for one in (fedvla_lib, fedvla_book))
 assert installed and sys.prefix == {prefix!r}, f"{{fedvla_lib.__file__}}, run by {{sys.prefix}}"
 """
 PROGRAM = "#!{python}\nimport sys\n\nfrom {module} import {attribute}\n\nsys.exit({attribute}())\n"

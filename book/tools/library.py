@@ -14,6 +14,11 @@ from IPython.core.inputtransformer2 import TransformerManager
 
 PACKAGE = "fedvla_lib"
 ROOT_FILES = "root"  # the room of the modules that stand in no package
+ARROWHEAD = (
+    '<defs><marker id="head" viewBox="0 0 8 8" refX="2" refY="4" markerWidth="5" markerHeight="5" orient="auto">'
+    '<polygon points="0,0 8,4 0,8" fill="#0072b2"/></marker></defs>'
+)
+LINE_STYLE = 'fill="none" stroke="#0072b2" stroke-width="2" marker-end="url(#head)"'
 CHAR, LINE, PAD, GAP, WIDTH = 6.6, 18, 12, 34, 760  # of the picture, in pixels
 
 
@@ -154,8 +159,9 @@ def picture(graph: networkx.DiGraph) -> str:
             boxes[room] = (PAD + column * (width + GAP), top, width, height, lines[room])
         top += height + GAP
     arrows = [_arrow(boxes[above], boxes[below]) for below, above in sorted(networkx.transitive_reduction(house).edges)]
-    size = f'width="{WIDTH + 2 * PAD}" height="{top}" viewBox="0 0 {WIDTH + 2 * PAD} {top}"'
-    ground = '<rect width="100%" height="100%" fill="#fff"/>'
+    wide = WIDTH + 2 * PAD + GAP
+    size = f'width="{wide}" height="{top}" viewBox="0 0 {wide} {top}"'
+    ground = f'{ARROWHEAD}<rect width="100%" height="100%" fill="#fff"/>'
     drawn = [*arrows, *(_box(room, *box) for room, box in boxes.items())]
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n{ground}\n' + "\n".join(drawn) + "\n</svg>\n"
 
@@ -176,13 +182,15 @@ Box = tuple[float, float, float, float, list[str]]
 
 
 def _arrow(above: Box, below: Box) -> str:
-    (x, y, width, height, _), (to_x, to_y, to_width, _, _) = above, below
-    start, end = (x + width / 2, y + height), (to_x + to_width / 2, to_y)
-    bend = min(GAP, (end[1] - start[1]) / 2)
-    return (
-        f'<path d="M{start[0]:.0f},{start[1]:.0f} C{start[0]:.0f},{start[1] + bend:.0f} {end[0]:.0f},'
-        f'{end[1] - bend:.0f} {end[0]:.0f},{end[1]:.0f}" fill="none" stroke="#0072b2" stroke-width="2"/>'
-    )
+    """A line down to the next row, or around the rows between on the right."""
+    (x, y, width, height, _), (to_x, to_y, to_width, to_height, _) = above, below
+    start, end = (x + width / 2, y + height), (to_x + to_width / 2, to_y - 6)
+    bend, to_bend = (start[0], start[1] + GAP / 2), (end[0], end[1] - GAP / 2)
+    if to_y - start[1] > GAP:
+        start, end = (x + width, y + height / 2), (to_x + to_width + 6, to_y + to_height / 2)
+        bend, to_bend = (start[0] + GAP, start[1]), (end[0] + GAP, end[1])
+    points = " ".join(f"{px:.0f},{py:.0f}" for px, py in (bend, to_bend, end))
+    return f'<path d="M{start[0]:.0f},{start[1]:.0f} C{points}" {LINE_STYLE}/>'
 
 
 def _box(room: str, x: float, y: float, width: float, height: float, lines: list[str]) -> str:
