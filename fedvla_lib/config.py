@@ -71,39 +71,18 @@ class Config:
 
 
 PROFILES: dict[str, dict[str, Any]] = {
-    "tiny": {
-        "episodes_per_task": 4,
-        "image_size": 64,
-        "num_clients": 3,
-        "num_server_rounds": 2,
-        "fraction_train": 1.0,
-        "local_steps": 2,
-        "batch_size": 4,
-        "warmup_steps": 1,
-        "eval_every": 0,
-        "eval_rollouts": 1,
-        "checkpoint_every": 2,
-        "num_threads": 1,  # a second thread costs more than it gains on so little work
+    "tiny": {  # one thread: a second one costs more than it gains on so little work
+        "episodes_per_task": 4, "image_size": 64, "num_clients": 3, "num_server_rounds": 2, "fraction_train": 1.0,
+        "local_steps": 2, "batch_size": 4, "warmup_steps": 1, "eval_every": 0, "eval_rollouts": 1,
+        "checkpoint_every": 2, "num_threads": 1,
     },
     "laptop": {},
     "gpu": {
-        "base": "lerobot/smolvla_base",
-        "train_state_proj": True,
-        "augment": True,
-        "image_size": 224,
-        "chunk_size": 50,
-        "n_action_steps": 50,
-        "episodes_per_task": 100,
-        "fraction_train": 1.0,
-        "local_steps": 200,
-        "batch_size": 64,
-        "lr": 1e-4,
-        "warmup_steps": 200,
-        "eval_every": 5,
-        "eval_rollouts": 20,
-        "device": "cuda",
+        "base": "lerobot/smolvla_base", "train_state_proj": True, "augment": True, "image_size": 224, "chunk_size": 50,
+        "n_action_steps": 50, "episodes_per_task": 100, "fraction_train": 1.0, "local_steps": 200, "batch_size": 64,
+        "lr": 1e-4, "warmup_steps": 200, "eval_every": 5, "eval_rollouts": 20, "device": "cuda",
     },
-}
+}  # fmt: skip
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
 NORMALISATIONS = ("pooled", "own", "held-out", "none")
 EXCHANGES = ("float32", "float16", "int8")
@@ -192,9 +171,8 @@ def _require(ok: bool, config: Config, name: str, valid: str) -> None:
 
 def _require_known(values: dict[str, Any]) -> dict[str, Any]:
     names = [field.name for field in fields(Config)]
-    for key in values:
-        if key not in names:
-            raise ValueError(f"unknown setting {key!r}: choose one of {', '.join(names)}")
+    if unknown := [key for key in values if key not in names]:
+        raise ValueError(f"unknown setting {unknown[0]!r}: choose one of {', '.join(names)}")
     return values
 
 

@@ -89,17 +89,10 @@ def config_hash(config: Config) -> str:
 def first_stamp(config: Config, engine: str) -> dict[str, Any]:
     """Return the stamp of a run that starts: commit, hash of the settings, versions, hardware."""
     return {
-        "status": "running",
-        "engine": engine,
-        "started": now(),
-        "wall_s": None,
-        "commit": _commit(),
-        "config_hash": config_hash(config),
-        "seed": config.seed,
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
-        "hardware": _hardware(config),
-    }
+        "status": "running", "engine": engine, "started": now(), "wall_s": None, "commit": _commit(),
+        "config_hash": config_hash(config), "seed": config.seed, "python": platform.python_version(),
+        "versions": {name: _version(name) for name in PACKAGES}, "hardware": _hardware(config),
+    }  # fmt: skip
 
 
 def _version(package: str) -> str | None:
@@ -111,12 +104,9 @@ def _version(package: str) -> str | None:
 
 def _hardware(config: Config) -> dict[str, Any]:
     return {
-        "machine": platform.machine(),
-        "system": platform.system(),
-        "cores": os.cpu_count(),
-        "device": config.device,
+        "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count(), "device": config.device,
         "memory_gb": round(memory_gib(), 1),
-    }
+    }  # fmt: skip
 
 
 def memory_gib() -> float:

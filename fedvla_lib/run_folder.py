@@ -97,15 +97,12 @@ def hold(root: Path) -> Iterator[None]:
     Raises:
         ValueError: another process holds the lock.
     """
-    lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S)
     try:
-        lock.acquire()
+        lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S).acquire()
     except Timeout as error:
         raise ValueError(f"{root} is in use: another process still writes to it") from error
-    try:
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
 def is_held(root: Path) -> bool:
@@ -218,15 +215,13 @@ def read_events(root: Path) -> list[dict[str, Any]]:
     path = Path(root) / METRICS_FILE
     if not path.is_file():
         raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")
-    lines = path.read_text().split("\n")[:-1]  # a last line without a newline was cut off by a crash
-    return [_event(path, number, line) for number, line in enumerate(lines, start=1)]
-
-
-def _event(path: Path, number: int, line: str) -> dict[str, Any]:
-    try:
-        return json.loads(line)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} line {number} is not an event: {error.msg}") from error
+    events = []
+    for number, line in enumerate(path.read_text().split("\n")[:-1], start=1):  # a crash cuts off the last line
+        try:
+            events.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path} line {number} is not an event: {error.msg}") from error
+    return events
 
 
 def run_folders(config: Config) -> set[Path]:

@@ -203,7 +203,8 @@ def check_threads(cores: int | None = None) -> Check:
 
 def check_hub(timeout_s: float = HUB_TIMEOUT_S) -> Check:
     """Check whether the Hugging Face Hub answers; only the gpu profile and data sets on the hub need it."""
-    offline = " (HF_HUB_OFFLINE=1 keeps the libraries offline)" if _hub_is_switched_off() else ""
+    is_off = os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}
+    offline = " (HF_HUB_OFFLINE=1 keeps the libraries offline)" if is_off else ""
     fix = "only needed for the gpu profile and data sets on the hub: connect, then export HF_HUB_OFFLINE=0"
     try:
         from huggingface_hub.constants import ENDPOINT
@@ -213,12 +214,7 @@ def check_hub(timeout_s: float = HUB_TIMEOUT_S) -> Check:
     except urllib.error.HTTPError as error:
         return Check("hub", True, f"answers with status {error.code}{offline}", fix, required=False)
     except (ImportError, OSError) as error:
-        reason = getattr(error, "reason", error)
-        return Check("hub", False, f"no answer: {reason}{offline}", fix, required=False)
-
-
-def _hub_is_switched_off() -> bool:
-    return os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}
+        return Check("hub", False, f"no answer: {getattr(error, 'reason', error)}{offline}", fix, required=False)
 
 
 def examine(folder: Path | None = None) -> list[Check]:

@@ -22,7 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 PEM, PKCS8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
 NO_PASSWORD = serialization.NoEncryption()
-DAYS = 7
+AUTHORITY, DAYS = "federation authority", 7
 LOCAL_HOSTS = ("localhost", "127.0.0.1")
 CLOCK_SKEW = timedelta(minutes=5)  # tolerated between machines
 CA_USAGE = x509.KeyUsage(
@@ -59,17 +59,16 @@ def make_server(folder: Path, hosts: Sequence[str] = (), *, until: datetime | No
     """
     until = until or datetime.now(UTC) + timedelta(days=DAYS)
     authority_key, server_key = ec.generate_private_key(ec.SECP384R1()), ec.generate_private_key(ec.SECP384R1())
-    authority_name = _name("federation authority")
     names = [_host(host) for host in dict.fromkeys([*hosts, *LOCAL_HOSTS])]
     authority = (
-        _certificate(authority_name, authority_name, authority_key, until)
+        _certificate(AUTHORITY, authority_key, until)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(CA_USAGE, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(authority_key.public_key()), critical=False)
         .sign(authority_key, hashes.SHA256())
     )
     server = (
-        _certificate(_name("federation server"), authority_name, server_key, until)
+        _certificate("federation server", server_key, until)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
@@ -94,13 +93,11 @@ def make_node_key(folder: Path, name: str) -> NodeKey:
     return files
 
 
-def _certificate(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime
-) -> x509.CertificateBuilder:
+def _certificate(subject: str, key: ec.EllipticCurvePrivateKey, until: datetime) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
+        .subject_name(_name(subject))
+        .issuer_name(_name(AUTHORITY))
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(min(datetime.now(UTC), until) - timedelta(days=1) - CLOCK_SKEW)

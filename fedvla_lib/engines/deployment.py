@@ -174,9 +174,9 @@ def progress_reporter(config: Config, before: set[Path], say: Callable[[str], No
                 continue
             seen.add(line)
             values = {key: event["values"][key] for key in REPORTED if event["values"].get(key) is not None}
-            shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
-            if shown and event["kind"] != "held-out":  # `evaluate` reports their averages
-                say(f"round {event['round']}, {event['who']}, {event['kind']}: {shown}")
+            text = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+            if text and event["kind"] != "held-out":  # `evaluate` reports their averages
+                say(f"round {event['round']}, {event['who']}, {event['kind']}: {text}")
 
     return report
 

@@ -64,13 +64,6 @@ class SuperLink:
             raise FlowerRunError(f"flwr run failed: {reason(self.log)}")
         return accepted[1]
 
-    def status(self, run_id: str) -> tuple[str, str]:
-        """Return the status of a run, such as ``running`` or ``finished:completed``, and its details."""
-        answer = self.ask("list", self.connection, "--run-id", run_id)
-        if not answer.get("runs"):
-            raise FlowerRunError(f"flwr list does not know run {run_id}")
-        return answer["runs"][0]["status"], answer["runs"][0].get("status-details") or "no details"
-
     def ask(self, *command: str) -> dict[str, Any]:
         """Run a `flwr` command and return its JSON output.
 
@@ -138,13 +131,18 @@ def require_completed(link: SuperLink, run_id: str) -> None:
 
 
 def last_status(link: SuperLink, run_id: str) -> tuple[str, str]:
-    """Return the final status and details of a run whose log has ended; the status may lag by up to half a minute."""
+    """Return the status, such as ``finished:completed``, and details of a run whose log has ended.
+
+    The status is polled for up to half a minute, since it may lag behind the log.
+    """
     for _ in range(STATUS_TRIES):
-        status, details = link.status(run_id)
-        if status.startswith("finished"):
+        runs = link.ask("list", link.connection, "--run-id", run_id).get("runs")
+        if not runs:
+            raise FlowerRunError(f"flwr list does not know run {run_id}")
+        if runs[0]["status"].startswith("finished"):
             break
         time.sleep(POLL_S)
-    return status, details
+    return runs[0]["status"], runs[0].get("status-details") or "no details"
 
 
 def answers(port: int, files: ServerFiles | None = None) -> bool:

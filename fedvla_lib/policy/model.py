@@ -89,11 +89,10 @@ def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
 def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
     """Return one row per part of the model: module, its plain name, parameters and trainable parameters."""
     rows = []
-    for prefix, meaning in MODULES.items():
-        named = [p for name, p in policy.named_parameters() if name.startswith(prefix)]
-        trainable = sum(p.numel() for p in named if p.requires_grad)
-        total = sum(p.numel() for p in named)
-        rows.append({"module": prefix, "part": meaning, "parameters": total, "trainable": trainable})
+    for prefix, part in MODULES.items():
+        sizes = {p: p.numel() for name, p in policy.named_parameters() if name.startswith(prefix)}
+        trained = sum(size for p, size in sizes.items() if p.requires_grad)
+        rows.append({"module": prefix, "part": part, "parameters": sum(sizes.values()), "trainable": trained})
     return rows
 
 
@@ -146,12 +145,9 @@ def _random_nano(config: Config) -> SmolVLAPolicy:
         torch.manual_seed(config.seed)
         policy = SmolVLAPolicy(settings)
         # At the default (0.02) a patch's position is lost against its content; with this the model learns to locate.
-        torch.nn.init.normal_(_vision_positions(policy), std=POSITION_STD)
+        embeddings = policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings
+        torch.nn.init.normal_(embeddings.position_embedding.weight, std=POSITION_STD)
     return policy.to(config.device)
-
-
-def _vision_positions(policy: SmolVLAPolicy) -> torch.Tensor:
-    return policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings.position_embedding.weight
 
 
 def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
@@ -166,17 +162,13 @@ def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line for each load
             policy = SmolVLAPolicy.from_pretrained(base, config=settings)
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
-        raise ValueError(_not_found(config.base, error)) from error
+        reason = str(error).strip().splitlines()[0][:160]
+        raise ValueError(
+            f"base={config.base!r} could not be loaded ({reason}): give {NANO!r}, {NANO_RANDOM!r}, a folder in "
+            "LeRobot's pretrained_model format, or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
+        ) from error
     _require_all_weights(policy, base)
     return policy
-
-
-def _not_found(base: str, error: Exception) -> str:
-    reason = str(error).strip().splitlines()[0][:160]
-    return (
-        f"base={base!r} could not be loaded ({reason}): give {NANO!r}, {NANO_RANDOM!r}, a folder in LeRobot's "
-        "pretrained_model format, or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
-    )
 
 
 def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:

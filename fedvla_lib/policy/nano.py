@@ -77,12 +77,9 @@ def _config(image_size: int, tokenizer: PreTrainedTokenizerFast) -> SmolVLMConfi
         "max_position_embeddings": 512, "pad_token_id": tokenizer.pad_token_id,
     }  # fmt: skip
     return SmolVLMConfig(
-        vision_config=vision,
-        text_config=text,
-        scale_factor=CONNECTOR_SCALE,
+        vision_config=vision, text_config=text, scale_factor=CONNECTOR_SCALE, pad_token_id=tokenizer.pad_token_id,
         image_token_id=tokenizer.convert_tokens_to_ids("<image>"),
-        pad_token_id=tokenizer.pad_token_id,
-    )
+    )  # fmt: skip
 
 
 def _tokenizer() -> PreTrainedTokenizerFast:
@@ -90,24 +87,17 @@ def _tokenizer() -> PreTrainedTokenizerFast:
     bpe.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     bpe.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
-        vocab_size=VOCAB_SIZE,
-        special_tokens=SPECIAL_TOKENS,
+        vocab_size=VOCAB_SIZE, special_tokens=SPECIAL_TOKENS, show_progress=False,
         initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
-        show_progress=False,
-    )
+    )  # fmt: skip
     bpe.train_from_iterator(CORPUS, trainer)
     return PreTrainedTokenizerFast(
-        tokenizer_object=bpe,
-        bos_token="<|im_start|>",
-        eos_token="<|im_end|>",
-        pad_token="<|im_end|>",
+        tokenizer_object=bpe, bos_token="<|im_start|>", eos_token="<|im_end|>", pad_token="<|im_end|>",
         extra_special_tokens={
-            "fake_image_token": "<fake_token_around_image>",
-            "image_token": "<image>",
-            "global_image_token": "<global-img>",
-            "end_of_utterance_token": "<end_of_utterance>",
+            "fake_image_token": "<fake_token_around_image>", "image_token": "<image>",
+            "global_image_token": "<global-img>", "end_of_utterance_token": "<end_of_utterance>",
         },
-    )
+    )  # fmt: skip
 
 
 def nano_base() -> Path:

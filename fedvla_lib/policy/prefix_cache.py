@@ -125,11 +125,9 @@ def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[tor
     tokens, words = _pad(inputs[OBS_LANGUAGE_TOKENS], length), _pad(inputs[OBS_LANGUAGE_ATTENTION_MASK], length)
     embedded, real, blocks = policy.model.embed_prefix(images, image_masks, tokens, words, policy.prepare_state(inputs))
     _, cache = policy.model.vlm_with_expert.forward(
-        attention_mask=make_att_2d_masks(real, blocks),
-        position_ids=torch.cumsum(real, dim=1) - 1,
-        inputs_embeds=[embedded, None],
-        use_cache=True,
-    )
+        attention_mask=make_att_2d_masks(real, blocks), position_ids=torch.cumsum(real, dim=1) - 1,
+        inputs_embeds=[embedded, None], use_cache=True,
+    )  # fmt: skip
     return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in cache.layers], 1), real
 
 

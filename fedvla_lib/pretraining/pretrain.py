@@ -42,13 +42,9 @@ TWO_CUBES = ("reach", "grip")  # tasks that can have a second cube
 def settings(recipe: Recipe) -> Config:
     """Return the settings of the action expert's training, with the vision-language part frozen."""
     shared = ("episodes_per_task", "image_size", "batch_size", "lr", "checkpoint_every", "num_threads", "seed")
-    return replace(
-        Config(),
-        base="nano-random",
-        tasks=",".join(PRETRAINING_TASKS),
-        warmup_steps=min(100, recipe.steps // 10),
-        **{name: getattr(recipe, name) for name in shared},
-    )
+    given = {name: getattr(recipe, name) for name in shared}
+    tasks, warmup_steps = ",".join(PRETRAINING_TASKS), min(100, recipe.steps // 10)
+    return replace(Config(), base="nano-random", tasks=tasks, warmup_steps=warmup_steps, **given)
 
 
 def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
@@ -121,11 +117,9 @@ def ground(
         )  # fmt: skip
         errors_m = pointing_error_m(bundle, Questions(unseen, bundle, recipe.batch_size, recipe.seed))
     return bundle, {
-        "seconds": result.seconds,
-        "phrase_tokens": len(errors_m),
-        "median_error_m": float(np.median(errors_m)),
+        "seconds": result.seconds, "phrase_tokens": len(errors_m), "median_error_m": float(np.median(errors_m)),
         "p90_error_m": float(np.quantile(errors_m, 0.9)),
-    }
+    }  # fmt: skip
 
 
 def _check(recipe: Recipe) -> None:
@@ -174,13 +168,8 @@ class _Misled(PolicyActor):
 
 def _seeds_with_two_cubes(task: str, count: int) -> list[int]:
     with closing(So100Env(task, cameras=(), render_mode=None)) as env:
-        seeds = (seed for seed in rollout_seeds(20 * count) if _num_cubes(env, seed) == 2)
+        seeds = (seed for seed in rollout_seeds(20 * count) if env.reset(seed=seed) and len(env.layout.cubes) == 2)
         return list(islice(seeds, count))
-
-
-def _num_cubes(env: So100Env, seed: int) -> int:
-    env.reset(seed=seed)
-    return len(env.layout.cubes)
 
 
 def _work_folder(recipe: Recipe) -> Path:
