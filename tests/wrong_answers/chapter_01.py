@@ -136,26 +136,26 @@ WRONG = {
             "the numbers of training",
         ),
     ],
-    "attempts_needed": [
+    "rollouts_needed": [
         (
-            "def attempts_needed(p, width):\n    n = 1\n"
+            "def rollouts_needed(p, width):\n    n = 1\n"
             "    while 2 * 1.96 * np.sqrt(p * (1 - p) / n) >= width:\n        n += 1\n    return n",
             "has no width",
         ),
         (
-            "def attempts_needed(p, width, z=1.96):\n    n = 1\n"
+            "def rollouts_needed(p, width, z=1.96):\n    n = 1\n"
             "    while z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n) >= width:\n"
             "        n += 1\n    return n",
             "from low to high",
         ),
         (
-            "def attempts_needed(p, width, z=1.96):\n    n = 1\n"
+            "def rollouts_needed(p, width, z=1.96):\n    n = 1\n"
             "    while 2 * z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) >= width:\n"
             "        n += 1\n    return n",
             "The factor in front",
         ),
         (
-            "def attempts_needed(p, width, z=1.96):\n    n = 10\n"
+            "def rollouts_needed(p, width, z=1.96):\n    n = 10\n"
             "    while 2 * z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n) >= width:\n"
             "        n += 10\n    return n",
             "each n in turn",

@@ -87,7 +87,7 @@ def _scaled(actions: np.ndarray, known: np.ndarray) -> np.ndarray:
     return (actions - known.mean(axis=0)) / known.std(axis=0)
 
 
-def attempts_needed(count: Callable[[float, float], int]) -> None:
+def rollouts_needed(count: Callable[[float, float], int]) -> None:
     """``count(rate, width)`` is the smallest number of attempts whose Wilson interval is narrower than `width`."""
     certain, even = count(1.0, 0.1), count(0.5, 0.2)
     expect(certain != 1, "At a rate of 1 your interval has no width; the root in Wilson's formula never vanishes.")
