@@ -76,7 +76,7 @@ def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
     actor = SameNoise(model.load_policy(config))
     with tempfile.TemporaryDirectory() as films:
         return rollouts.evaluate(
-            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), films=FILMS, progress=False
+            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), num_videos=FILMS, progress=False
         )
 
 

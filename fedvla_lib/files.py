@@ -1,4 +1,4 @@
-"""Where files are cached, and how a file or folder appears whole or not at all."""
+"""The cache folder, and atomic writes of files and folders."""
 
 import json
 import math
@@ -13,26 +13,26 @@ from safetensors import SafetensorError
 
 
 def cache_dir() -> Path:
-    """Return where recordings, decoded frames and meshes are kept: ``$FEDVLA_CACHE``, else ``~/.cache/fedvla``."""
+    """Return the folder of cached recordings, frames, meshes and models: ``$FEDVLA_CACHE`` or ``~/.cache/fedvla``."""
     return Path(os.environ.get("FEDVLA_CACHE") or Path.home() / ".cache" / "fedvla")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` as readable JSON, whole or not at all."""
+    """Write `content` as indented JSON, atomically."""
     write_atomically(path, (json.dumps(as_json(content), indent=2) + "\n").encode())
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all."""
+    """Write a file that is either complete or absent."""
     with new_file(path) as draft:
         draft.write_bytes(content)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yield a place beside `path` to write to; what is there when the block ends without an error moves to `path`."""
+    """Yield a temporary path next to `path`, renamed to `path` if the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{os.getpid()}.{path.name}")  # the suffix stays: NumPy would add its own
+    draft = path.with_name(f".{os.getpid()}.{path.name}")  # same suffix: NumPy would add its own
     try:
         yield draft
         os.replace(draft, path)
@@ -42,17 +42,17 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield an empty folder beside `folder`; it moves there when the block ends without an error.
+    """Yield an empty temporary folder, renamed to `folder` if the block ends without an error.
 
     Args:
-        replace: whether a folder that is there by then gives way. If not it stays: another process was faster.
+        replace: replace an existing folder. Otherwise it is kept: another process was faster.
 
     Raises:
-        OSError: safetensors could not write, for which it has an error of its own; the message names `folder`.
+        OSError: also for write errors of safetensors, which has its own exception; the message names `folder`.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = folder.with_name(f".{os.getpid()}.{folder.name}")
-    shutil.rmtree(draft, ignore_errors=True)  # left by a process of this number that was killed
+    shutil.rmtree(draft, ignore_errors=True)  # left by a killed process with this id
     draft.mkdir()
     try:
         yield draft
@@ -70,7 +70,7 @@ def new_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def as_json(value: Any) -> Any:
-    """Make `value` valid JSON: NumPy scalars become numbers, numbers that are not finite become null."""
+    """Convert `value` to valid JSON: NumPy scalars become numbers, non-finite numbers become null."""
     if isinstance(value, dict):
         return {str(key): as_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -272,9 +272,9 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def compare(options: argparse.Namespace) -> None:
     """Print what runs measured and how they differ; refuse runs that cannot be compared."""
-    from fedvla_lib.evaluation import compare_runs
+    from fedvla_lib.evaluation import compare_runs, statistics
 
-    metrics = compare_runs.check_metrics(options.metrics.split(","))
+    metrics = statistics.check_metrics(options.metrics.split(","), compare_runs.METRICS)
     if len(options.runs) < 2 or len({path.resolve() for path in options.runs}) < len(options.runs):
         raise ValueError(f"runs {', '.join(map(str, options.runs))}: give two or more different run folders")
     if not 0.5 <= options.confidence < 1:
@@ -301,9 +301,9 @@ def videos(options: argparse.Namespace) -> int:
     """Print a table for each measurement, and every damaged file; 1 if there is one."""
     import pandas as pd
 
-    from fedvla_lib.evaluation import video_report
+    from fedvla_lib.evaluation import statistics, video_report
 
-    metrics = video_report.check_metrics(options.metrics.split(","))
+    metrics = statistics.check_metrics(options.metrics.split(","), video_report.METRICS)
     rows, damaged = video_report.read_videos(options.folder)
     if options.who and len(rows):
         filmed = sorted(set(rows.who))

@@ -1,5 +1,5 @@
-"""How good a policy is: error on held-out frames, success in closed loop, intervals, paired tests, videos.
+"""Policy evaluation: error on held-out frames, success in closed loop, confidence intervals, paired tests, videos.
 
-May import `policy`, `data` and `robot`; Matplotlib in `figures` alone. Start reading with `measure`, which measures one
-model once, then `statistics`.
+May import `policy`, `data` and `robot`; Matplotlib in `figures` alone. Start reading with `measure`, which evaluates
+a model, then `statistics`.
 """

@@ -1,4 +1,4 @@
-"""Figures that commands write beside their tables: a metric by round, and differences between runs."""
+"""Figures that commands write next to their tables: a metric by round, and differences between runs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
-WIDTH = 7  # inches; on a page a wider figure shrinks, and its text with it
+WIDTH = 7  # inches; a page scales wider figures down, text included
 
 
 def by_round(table: pd.DataFrame, value: str, *, ylabel: str, label: str = "", ax: Axes | None = None) -> Axes:
@@ -40,7 +40,7 @@ def new_axes() -> Axes:
 
 
 def round_ticks(ax: Axes, rounds: pd.Series) -> None:
-    """A tick for each round, or for some of them where the labels of all would touch."""
+    """Put a tick at each round, or at some of them where all labels would overlap."""
     numbers = sorted(set(rounds))
     if len(numbers) <= 8:
         ax.set_xticks(numbers)
@@ -49,10 +49,10 @@ def round_ticks(ax: Axes, rounds: pd.Series) -> None:
 
 
 def run_differences(table: pd.DataFrame, *, note: str = "") -> Sequence[Axes]:
-    """Draw each metric's differences to the first run with their intervals; columns run, against, metric, difference...
+    """Draw each metric's differences to the first run with their intervals: a table of `compare_runs.differences`.
 
     Args:
-        note: what makes the runs incomparable; it becomes the title.
+        note: what makes the runs incomparable, shown as the title.
     """
     metrics = list(dict.fromkeys(table.metric))
     figure, axes = plt.subplots(1, len(metrics), figsize=(WIDTH, 1.2 + 0.4 * table.run.nunique()), squeeze=False)
@@ -71,7 +71,7 @@ def run_differences(table: pd.DataFrame, *, note: str = "") -> Sequence[Axes]:
 
 
 def save(axes: Axes | Sequence[Axes], path: Path) -> None:
-    """Write the figure of the axes as a picture, and close it."""
+    """Write the figure of the axes to an image file and close it."""
     figure = (axes if isinstance(axes, Axes) else axes[0]).figure
     figure.savefig(path, bbox_inches="tight")
     plt.close(figure)

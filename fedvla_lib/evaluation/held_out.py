@@ -18,18 +18,18 @@ from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES
 
 @torch.no_grad()
 def validate(bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0) -> dict[str, float]:
-    """Measure the policy on held-out raw batches; see `measure_frames` and `average`."""
+    """Return the averages of `measure_frames` over all frames of the batches."""
     return average(measure_frames(bundle, batches, tolerance=tolerance, seed=seed))
 
 
 def measure_frames(
     bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0
 ) -> dict[str, np.ndarray]:
-    """Measure the policy on each held-out frame with fixed noise and flow time, so that models can be compared.
+    """Measure the policy on each frame of held-out raw batches, with noise and flow time fixed by `seed`.
 
     Returns:
-        Arrays with an entry for each frame, over the valid actions of its chunk:
-        num_actions: how many they are;
+        Arrays with an entry for each frame, over the valid (not padded) actions of its chunk:
+        num_actions: number of valid actions;
         loss: flow-matching loss, in normalised units;
         action_error: mean absolute error of the predicted joint targets, over all joints (degrees; gripper 0-100);
         action_accuracy: share of predicted joint targets within `tolerance` of the demonstration;
@@ -38,14 +38,14 @@ def measure_frames(
     if not batches:
         raise ValueError("no held-out batches: give at least one validation episode")
     generator = torch.Generator().manual_seed(seed)
-    of_batches = [_measure(bundle, batch, generator, tolerance) for batch in batches]
-    return {name: np.concatenate([of_batch[name] for of_batch in of_batches]) for name in of_batches[0]}
+    measured = [_measure(bundle, batch, generator, tolerance) for batch in batches]
+    return {name: np.concatenate([arrays[name] for arrays in measured]) for name in measured[0]}
 
 
 def average(frames: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the mean of each measurement over all valid actions of the given frames."""
     weights = frames["num_actions"]
-    return {name: float(np.average(of, weights=weights)) for name, of in frames.items() if name != "num_actions"}
+    return {name: float(np.average(each, weights=weights)) for name, each in frames.items() if name != "num_actions"}
 
 
 def _measure(
@@ -56,21 +56,19 @@ def _measure(
     error = (predict_chunk(bundle, batch, generator) - batch[ACTION_KEY]).abs().double().numpy()  # (B, chunk, 6)
     num_actions = valid.sum(axis=1)
     by_joint = (error * valid[..., None]).sum(axis=1) / num_actions[:, None]
-    close = ((error <= tolerance) & valid[..., None]).sum(axis=(1, 2)) / (num_actions * error.shape[-1])
+    accuracy = ((error <= tolerance) & valid[..., None]).sum(axis=(1, 2)) / (num_actions * error.shape[-1])
     joints = {f"action_error.{name}": by_joint[:, i] for i, name in enumerate(JOINT_NAMES)}
     return {
-        "num_actions": num_actions, "loss": loss, "action_error": by_joint.mean(axis=1), "action_accuracy": close,
-        **joints,
+        "num_actions": num_actions, "loss": loss, "action_error": by_joint.mean(axis=1),
+        "action_accuracy": accuracy, **joints,
     }  # fmt: skip
 
 
 def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> np.ndarray:
-    """Flow-matching loss of each frame, (B,), with noise ~ N(0, 1) and time spread evenly over (0, 1).
-
+    """Flow-matching loss of each frame, (B,), with noise ~ N(0, 1), time spread evenly over (0, 1) and
     x_t = t noise + (1 - t) action.
     """
-    settings = bundle.policy.config
-    size = len(batch["task"])
+    settings, size = bundle.policy.config, len(batch["task"])
     noise = torch.randn((size, settings.chunk_size, settings.max_action_dim), generator=generator)
     times = (torch.randperm(size, generator=generator) + 0.5) / size
     inputs = bundle.preprocess(dict(batch))
@@ -80,14 +78,14 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.double().cpu().numpy()
 
 
-VALIDATION_STRIDE = 5  # held-out frames are taken every half second: neighbours are nearly copies
-VALIDATION_BATCH = 32  # fixed, so that the noise of a validation does not depend on the settings of training
+VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly the same
+VALIDATION_BATCH = 32  # fixed, so that the noise does not depend on the batch size of training
 
 
 def held_out_frames(
     bundle: model.Bundle, store: frame_store.FrameStore, episode_ids: Sequence[int], config: Config
 ) -> dict[str, np.ndarray]:
-    """Return `train.measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
+    """Return `measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
     batches = held_out_batches(store, episode_ids, config)
     if not batches:
         return {}
@@ -97,13 +95,12 @@ def held_out_frames(
 def by_episode(
     frames: dict[str, np.ndarray], store: frame_store.FrameStore, episode_ids: Sequence[int]
 ) -> list[dict[str, float]]:
-    """Return averages for each episode of what `held_out_frames` measured, with episode_id and num_examples."""
+    """Return the averages of `held_out_frames` for each episode, with episode_id and num_examples."""
     counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
     ends = np.cumsum(counts)
-    of_each = [{name: of[end - n : end] for name, of in frames.items()} for n, end in zip(counts, ends, strict=True)]
     return [
-        {"episode_id": episode, "num_examples": n, **average(of)}
-        for episode, n, of in zip(episode_ids, counts, of_each, strict=True)
+        {"episode_id": episode, "num_examples": n, **average({k: each[end - n : end] for k, each in frames.items()})}
+        for episode, n, end in zip(episode_ids, counts, ends, strict=True)
     ]
 
 

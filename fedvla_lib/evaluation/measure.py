@@ -1,6 +1,6 @@
-"""Measure one model once: error on held-out episodes, then success in closed loop.
+"""Evaluate one model: error on held-out episodes, then success in closed loop.
 
-A federated round, a pooled training, a cell of an experiment and a search all measure a model here.
+Shared by federated rounds, centralized training, experiment cells and searches.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from fedvla_lib.run_folder import RunFolder
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was measured of one model."""
+    """Evaluation results of one model."""
 
-    episodes: list[dict[str, float]]  # of each held-out episode: episode_id, num_examples (frames) and averages
+    episodes: list[dict[str, float]]  # for each held-out episode: episode_id, num_examples (frames) and averages
     averages: dict[str, float]  # over all held-out frames, see `held_out.measure_frames`; empty without episodes
     rollouts: list[dict[str, Any]]  # rows of `rollouts.evaluate`
 
@@ -31,11 +31,11 @@ class Measurement:
         return sum(episode["num_examples"] for episode in self.episodes)
 
     def success(self) -> dict[str, float]:
-        """Return the success rate; nothing without rollouts."""
+        """Return the success rate; empty without rollouts."""
         return {"success_rate": success_rate(self.rollouts)} if self.rollouts else {}
 
     def success_by_task(self, tasks: Sequence[str]) -> dict[str, float]:
-        """Return the success rate of each task; nothing without rollouts."""
+        """Return the success rate of each task that has rollouts."""
         by_task = {task: [row for row in self.rollouts if row["task"] == task] for task in tasks}
         return {f"success_rate.{task}": success_rate(rows) for task, rows in by_task.items() if rows}
 
@@ -50,11 +50,11 @@ def measure(
     videos_dir: Path | None = None,
     progress: bool = False,
 ) -> Measurement:
-    """Measure a model on held-out episodes and, with `seeds`, in one rollout for each task of the mix and seed.
+    """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task of the mix and seed.
 
     Args:
-        episode_ids: episodes to measure on; None takes all that are held out.
-        videos_dir: where videos of the rollouts go; None records none.
+        episode_ids: None takes all held-out episodes.
+        videos_dir: folder for videos of the rollouts; None records none.
     """
     ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
     frames = held_out_frames(bundle, store, ids, config)
@@ -63,20 +63,20 @@ def measure(
 
 
 def log_measurement(run: RunFolder, round_number: int, who: str, found: Measurement) -> None:
-    """Write a measurement to a run: an event for each held-out episode and each rollout."""
+    """Log an event for each held-out episode and each rollout."""
     for episode in found.episodes:
         run.log(round_number, who, "held-out", episode)
     log_rollouts(run, round_number, who, found.rollouts)
 
 
 def log_rollouts(run: RunFolder, round_number: int, who: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Write an event for each rollout; paths of videos become relative to the run folder."""
+    """Log an event for each rollout; paths of videos become relative to the run folder."""
     for row in rows:
         run.log(round_number, who, "rollout", {**row, "video": run.relative(row["video"])})
 
 
 def is_validated(config: Config, round_number: int) -> bool:
-    """Whether a round's global model is kept and measured: every `validate_every` rounds, and before rollouts."""
+    """Whether a round's global model is saved and evaluated: every `validate_every` rounds, and before rollouts."""
     return round_number % config.validate_every == 0 or rolls_out(config, round_number)
 
 

@@ -1,7 +1,8 @@
-"""Rollouts as mp4 videos with their trajectories, and videos read back."""
+"""Write rollouts as mp4 videos with their trajectories, and read videos back."""
 
 import io
 import tempfile
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -12,31 +13,33 @@ from fedvla_lib.files import write_atomically
 from fedvla_lib.robot.rollout import Episode
 from fedvla_lib.robot.spec import CAMERAS, FPS
 
-VIDEO_SCALE = 2  # whole pixels are doubled: 96 px cameras are small on a page
+VIDEO_SCALE = 2  # integer upscaling: 96 px cameras are small on a page
 
 
 def save_rollout(episode: Episode, folder: Path) -> Path:
     """Write video and trajectory of a rollout and return the video's path; existing files are never overwritten."""
     stamp = datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     path = folder / f"rollout_{stamp}_{episode.task}_{episode.seed}.mp4"
-    write_atomically(path, encode_video(side_by_side(episode)))
+    frames = side_by_side([episode.images[camera] for camera in CAMERAS])
+    write_atomically(path, encode_video(frames.repeat(VIDEO_SCALE, axis=1).repeat(VIDEO_SCALE, axis=2)))
     trajectory = io.BytesIO()
     np.savez(trajectory, states=episode.states, actions=episode.actions, success=episode.success, seed=episode.seed)
     write_atomically(path.with_suffix(".npz"), trajectory.getvalue())
     return path
 
 
-def side_by_side(episode: Episode) -> np.ndarray:
-    """Put the cameras next to each other, enlarged: uint8 (T, H, W, 3)."""
-    frames = np.concatenate([episode.images[camera] for camera in CAMERAS], axis=2)
-    return frames.repeat(VIDEO_SCALE, axis=1).repeat(VIDEO_SCALE, axis=2)
+def side_by_side(videos: Sequence[np.ndarray]) -> np.ndarray:
+    """Join videos of one height, uint8 (T, H, W, 3), left to right; shorter ones repeat their last frame."""
+    longest = max(map(len, videos))
+    padded = [np.concatenate([frames, frames[-1:].repeat(longest - len(frames), axis=0)]) for frames in videos]
+    return np.concatenate(padded, axis=2)
 
 
 def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
     """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first.
 
     Raises:
-        ValueError: frames of another shape or type, none at all, or odd sides (yuv420p halves them).
+        ValueError: wrong shape or dtype, no frames, or odd width or height (yuv420p halves both).
     """
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
         raise ValueError(f"frames are {frames.dtype} {frames.shape}: give uint8 (T, H, W, 3) with T > 0")
@@ -56,14 +59,14 @@ def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
 
 
 def read_video(path: Path) -> np.ndarray:
-    """Decode an mp4 whole: uint8 (T, H, W, 3).
+    """Decode an mp4: uint8 (T, H, W, 3).
 
     Raises:
-        ValueError: the file is no readable video; the message names it.
+        ValueError: the file cannot be decoded; the message names it.
     """
     av.logging.set_level(None)  # LeRobot's encoder leaves libav printing to stderr; the exception says what is wrong
     try:
         with av.open(str(path)) as container:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
-    except (av.FFmpegError, ValueError, OSError, IndexError) as error:  # IndexError: no stream of pictures
+    except (av.FFmpegError, ValueError, OSError, IndexError) as error:  # IndexError: no video stream
         raise ValueError(f"{path} is not a readable video: {error}") from error

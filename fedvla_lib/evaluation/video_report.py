@@ -1,4 +1,4 @@
-"""A folder of rollout videos -> what the trajectories beside them say, round by round; damaged files are listed."""
+"""Check a folder of rollout videos against their trajectories and report metrics by round; list damaged files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,10 +21,10 @@ METRICS = {
 
 
 def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
-    """Read every ``round_N/WHO/rollout_*.mp4`` under `folder` with its trajectory, and check one against the other.
+    """Read every ``round_N/WHO/rollout_*.mp4`` under `folder` and check it against its trajectory.
 
     Returns:
-        A row for each sound rollout (round, who, task, seed, success, steps, completion_time, action_smoothness), and
+        A row for each intact rollout (round, who, task, seed, success, steps, completion_time, action_smoothness), and
         a line for each damaged one: which file, and what is wrong.
 
     Raises:
@@ -46,39 +46,27 @@ def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
 def _read(video: Path) -> dict[str, Any]:
     if not video.is_file():
         raise ValueError("the trajectory has no video")
-    kept = _trajectory(video.with_suffix(".npz"))
-    frames, steps = len(read_video(video)), len(kept["actions"])
+    trajectory = _trajectory(video.with_suffix(".npz"))
+    frames, steps = len(read_video(video)), len(trajectory["actions"])
     if frames != steps:
         raise ValueError(f"the video has {frames} frames, its trajectory {steps} steps")
-    success = bool(kept["success"])
+    success = bool(trajectory["success"])
     return {
         "round": int(video.parts[-3].removeprefix("round_")), "who": video.parts[-2],
-        "task": video.stem.rsplit("_", 2)[1], "seed": int(kept["seed"]), "success": success, "steps": steps,
+        "task": video.stem.rsplit("_", 2)[1], "seed": int(trajectory["seed"]), "success": success, "steps": steps,
         "completion_time": steps / FPS if success else float("nan"),
-        "action_smoothness": rollouts.smoothness(kept["actions"]),
+        "action_smoothness": rollouts.smoothness(trajectory["actions"]),
     }  # fmt: skip
 
 
 def _trajectory(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
-        raise ValueError("no trajectory lies beside it")
+        raise ValueError("the video has no trajectory")
     try:
-        with np.load(path) as kept:
-            return {name: kept[name] for name in ("actions", "success", "seed")}
+        with np.load(path) as arrays:
+            return {name: arrays[name] for name in ("actions", "success", "seed")}
     except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
         raise ValueError(f"its trajectory cannot be read: {error}") from error
-
-
-def check_metrics(metrics: Sequence[str]) -> list[str]:
-    """Return the metrics.
-
-    Raises:
-        ValueError: one of them is unknown.
-    """
-    for metric in metrics:
-        if metric not in METRICS:
-            raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(METRICS)}")
-    return list(metrics)
 
 
 def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.DataFrame:
@@ -86,20 +74,17 @@ def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.Data
     lines = []
     for number, part in rows.groupby("round"):
         each = part["success" if metric == "success_rate" else metric].dropna().to_numpy(float)
-        low, high = float("nan"), float("nan")
+        value, low, high = float(each.mean()) if len(each) else float("nan"), float("nan"), float("nan")
         if metric == "success_rate":
             low, high = statistics.wilson(int(each.sum()), len(each))
         elif len(each):
             low, high = statistics.mean_interval(each, seed=seed)
-        value = float(each.mean()) if len(each) else float("nan")
         lines.append({"round": number, "metric": metric, "n": len(each), "value": value, "low": low, "high": high})
     return pd.DataFrame(lines)
 
 
 def write(out: Path, rows: pd.DataFrame, table: pd.DataFrame, damaged: Sequence[str]) -> None:
-    """Write every rollout and every round as CSV, damaged files as JSON, and a figure of the trend into `out`."""
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    """Write rollouts and rounds as CSV, damaged files as JSON, and a figure of the trend into `out`."""
     files.write_atomically(out / "rollouts.csv", rows.to_csv(index=False).encode())
     files.write_atomically(out / "rounds.csv", table.to_csv(index=False).encode())
     files.write_json(out / "damaged.json", list(damaged))

@@ -1,4 +1,4 @@
-"""What the book compares: methods, grids of them over partitions and seeds, their tables, a search.
+"""What the book compares: methods, grids of them over partitions and seeds, result tables, a hyperparameter search.
 
-May import every room but `cli`. Start reading with `methods`, then `plan` for the file that describes a grid.
+May import every room but `cli`. Start reading with `methods`, then `plan` for the experiment file.
 """

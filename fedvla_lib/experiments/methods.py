@@ -1,10 +1,9 @@
-"""The four ways of training that the book compares, on the same data and from the same start.
+"""The methods that the book compares, on the same data and from the same base.
 
-``base`` is the start itself; ``local-only`` is one client on its own episodes; ``federated`` is Flower's FedAvg over
-all clients; ``centralized`` pools the clients' training episodes. From the same settings, *centralized* is given the
-steps that all clients of the federation do together, and *local-only* its share of them, which is fewer: total over
-number of clients. What a model then took is counted while it trains, see `counted`. Results are kept in the cache and
-found again by settings and by the code that decides them, so that a change of either trains anew.
+``base`` is the untrained start; ``local-only`` trains one client on its own episodes; ``federated`` is a federated run
+over all clients; ``centralized`` trains on all clients' episodes. *centralized* gets the total gradient steps of the
+federation, *local-only* that total over the number of clients. Results are cached by settings and by the digest of the
+code that determines them, so a change of either trains again.
 """
 
 import hashlib
@@ -28,28 +27,28 @@ from fedvla_lib.policy.training import TrainResult, local_train
 from fedvla_lib.provenance import code_digest
 
 CENTRALIZED = "centralized"
-STEPS_FILE = "steps.json"  # beside the weights of a model in the cache: the steps that it took, counted
+STEPS_FILE = "steps.json"  # next to a cached model's weights: its gradient steps as counted while training
 
 
 def total_steps(config: Config) -> int:
-    """Gradient steps that a federated run asks of all clients together: what the centralized method may spend."""
+    """Planned gradient steps of a federated run, summed over clients; the budget of centralized training."""
     return steps_in_a_row(config) * draw_size(config.fraction_train, config.num_clients)
 
 
 def steps_per_client(config: Config) -> int:
-    """Gradient steps that a federated run asks of one client, on average where a round draws some of them."""
+    """Planned gradient steps per client of a federated run: the average if rounds sample clients."""
     return max(1, total_steps(config) // config.num_clients)
 
 
 def steps_in_a_row(config: Config) -> int:
-    """Gradient steps that a federated run asks for between start and last global model, one after the other."""
+    """Planned sequential gradient steps between base and last global model of a federated run."""
     return config.num_server_rounds * config.local_steps
 
 
 def federated(config: Config, progress: bool = True) -> Path:
-    """Return the folder of a completed run with these settings, running it in this process if there is none."""
+    """Return the run folder of a completed run with these settings; run it in this process if there is none."""
     out = cache_dir() / "runs" / _key(config)
-    with _alone(out):
+    with _lock(out):
         for folder in sorted(out.glob("*/")):
             if run_folder.read_stamp(folder)["status"] == "completed":
                 return folder
@@ -63,46 +62,45 @@ def federated_policy(config: Config) -> model.Bundle:
 
 
 def base(config: Config) -> model.Bundle:
-    """Return the model every method starts from, with the normalisation of the pooled training episodes."""
+    """Return the model that every method starts from, with the statistics of the pooled training episodes."""
     pooled = normalisation.common_statistics(config, open_pooled(config).statistics())
     return model.load_policy(config, pooled)
 
 
 def centralized(config: Config, progress: bool = True) -> model.Bundle:
-    """Train on all clients' training episodes for the steps that all clients do together."""
-    whole = open_pooled(config)
-    return _kept(config, CENTRALIZED, lambda: _train(config, whole, total_steps(config), progress))
+    """Train on all clients' training episodes for `total_steps`, or load the cached model."""
+    pooled = open_pooled(config)
+    return _cached(config, CENTRALIZED, lambda: _train(config, pooled, total_steps(config), progress))
 
 
 def local_only(config: Config, partition_id: int, progress: bool = True) -> model.Bundle:
-    """Train on one client's episodes alone, for as many steps as the federation asks of it on average.
+    """Train on one client's episodes for `steps_per_client`, or load the cached model.
 
-    The normalisation is the pooled one, as in the federation: what differs is only whose episodes are seen.
+    Normalisation uses the pooled statistics, as in the federation.
     """
-    client = open_client(config, partition_id)
-    steps = steps_per_client(config)
-    return _kept(config, _alone_name(partition_id), lambda: _train(config, client, steps, progress))
+    client, steps = open_client(config, partition_id), steps_per_client(config)
+    return _cached(config, _local_name(partition_id), lambda: _train(config, client, steps, progress))
 
 
 def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:
-    """Return the gradient steps that a model in the cache took, counted while it trained: ``in_all``, ``in_a_row``.
+    """Return the gradient steps of a cached model as counted while training: ``in_all`` and ``in_a_row``.
 
-    The two are equal here. They differ in a federation, whose clients train side by side: `run_folder.counted_steps`.
+    Both are equal here; they differ for federated runs, see `run_folder.counted_steps`.
 
     Args:
-        partition_id: the client that trained alone; None for the centralized model.
+        partition_id: client of a local-only model; None for the centralized model.
 
     Raises:
-        ValueError: there is no such model with these settings yet.
+        ValueError: no model with these settings is cached.
     """
-    name = CENTRALIZED if partition_id is None else _alone_name(partition_id)
+    name = CENTRALIZED if partition_id is None else _local_name(partition_id)
     file = _place(config, name) / STEPS_FILE
     if not file.is_file():
         raise ValueError(f"{name} has not been trained with these settings: train it before asking for its steps")
     return json.loads(file.read_text())
 
 
-def _alone_name(partition_id: int) -> str:
+def _local_name(partition_id: int) -> str:
     return f"local-only-{partition_id}"
 
 
@@ -111,23 +109,22 @@ def _train(config: Config, client: Client, steps: int, progress: bool) -> tuple[
     return bundle, train_alone(bundle, client, steps=steps, progress=progress)
 
 
-def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **how: Any) -> TrainResult:
-    """Train a policy in place on one client's episodes; `how` goes to `local_train`."""
+def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **options: Any) -> TrainResult:
+    """Train a policy in place on one client's episodes; `options` are passed to `local_train`."""
     batches = prefix_cache.with_cached_prefixes(bundle, client.batches())
-    return local_train(bundle, batches, client.config, steps=steps, **how)
+    return local_train(bundle, batches, client.config, steps=steps, **options)
 
 
-def _kept(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
-    """Load the method's model from the cache, or train and keep it."""
+def _cached(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
+    """Load the method's model from the cache, or train and cache it."""
     folder = _place(config, name)
-    with _alone(folder):
+    with _lock(folder):
         if not folder.exists():
-            _keep(folder, *train())
+            _save(folder, *train())
     return model.load_policy(replace(config, base=str(folder)))
 
 
-def _keep(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
-    """Write the model and, beside it, the steps that it took."""
+def _save(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
     with files.new_folder(folder) as draft:
         model.write_policy(bundle, draft)
         files.write_json(draft / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
@@ -137,18 +134,18 @@ def _place(config: Config, name: str) -> Path:
     return cache_dir() / "methods" / f"{name}-{_key(config)}"
 
 
-def _alone(kept: Path) -> FileLock:
-    """A lock beside what is kept: of two chapters that want the same model, the second waits and trains nothing."""
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    return FileLock(kept.with_name(f"{kept.name}.lock"))
+def _lock(cached: Path) -> FileLock:
+    """If two processes want the same model, the second waits and then loads it."""
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(cached.with_name(f"{cached.name}.lock"))
 
 
 def trained_by() -> str:
-    """Return the digest of the code that decides what a method's model learns."""
+    """Return the digest of the code that determines what a method's model learns."""
     return code_digest(federated)
 
 
 def _key(config: Config) -> str:
-    """Identify settings, start and code: what older code or another base brought must not pass for a result of this."""
-    whole = "|".join([provenance.config_hash(config), nano.base_digest(config.base), trained_by()])
-    return hashlib.sha256(whole.encode()).hexdigest()[:16]
+    """Cache key of settings, base weights and code, so that results of older code or another base are not reused."""
+    parts = [provenance.config_hash(config), nano.base_digest(config.base), trained_by()]
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]

@@ -1,4 +1,26 @@
-"""TODO what this file is for."""
+"""Read an experiment file (TOML) into the cells of a grid: methods x partitions x seeds.
+
+::
+
+    profile = "laptop"          # defaults of all settings
+    seeds = [0, 1, 2]           # a seed fixes partition, client sampling, batches and noise
+    rollouts = 50               # per task and cell; for kind "clients", per client
+    first_rollout_seed = 2_000_000
+
+    [settings]                  # of every cell
+    local_steps = 20
+
+    [partitions.by_task]        # every method runs on every partition
+    partition = "task"
+
+    [methods.fedavg]            # a kind of training and its settings
+    kind = "federated"          # or base; centralized; local-only: each client alone, the rollouts dealt out over them;
+                                # or clients: each client's model after a federated run, on the client's tasks
+
+    [[only]]                    # optional: keep only cells that match one of these rules
+    method = "fedavg"
+    partition = "by_task"
+"""
 
 import re
 import tomllib
@@ -12,9 +34,9 @@ from fedvla_lib.evaluation.rollouts import rollout_seeds
 
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
 NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "methods", "only"}
-KINDS = ("base", "federated", "centralized", "local-only", "clients")  # of training, and of what is measured of it
+KINDS = ("base", "federated", "centralized", "local-only", "clients")
 RULES = ("method", "partition", "seed", "kind")  # what a rule under [[only]] may name
-# A cell's own evaluation is larger than the one inside a run, which would cost time and decide nothing.
+# A cell has an evaluation of its own; evaluations inside its training would cost time and decide nothing.
 QUIET = {"fraction_evaluate": 0.0, "eval_every": 0, "eval_rollouts": 0, "client_rollouts": 0, "checkpoint_every": 0}
 
 
@@ -30,70 +52,69 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the cell's folder."""
+        """Name of the cell's run folder."""
         return f"{self.partition}_{self.method}_{self.seed}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What an experiment file asks for."""
+    """The cells of an experiment and the seeds of their rollouts."""
 
     cells: list[Cell]
     rollout_seeds: list[int]
 
 
 def read_plan(file: Path) -> Plan:
-    """Return the cells that an experiment file describes, seed by seed, so that an early stop leaves whole seeds.
+    """Return the cells of an experiment file, ordered by seed so that an early stop leaves complete seeds.
 
     Raises:
-        ValueError: the file cannot be parsed, or holds a name or value that cannot be used.
+        ValueError: the file cannot be parsed, or has an unknown name or a bad value.
     """
     try:
-        told = tomllib.loads(Path(file).read_text())
+        content = tomllib.loads(Path(file).read_text())
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{file}: {error}") from error
     for name in ("methods", "partitions", "seeds", "rollouts"):
-        if not told.get(name):
+        if not content.get(name):
             raise ValueError(f"{file} lacks {name!r}: give one of each of methods, partitions, seeds and rollouts")
-    if unknown := sorted(set(told) - NAMES):
+    if unknown := sorted(set(content) - NAMES):
         raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
-    _check_types(told, Path(file))
-    cells = [cell for cell in _cells(told, Path(file)) if _wanted(cell, told.get("only", []))]
-    return Plan(cells, rollout_seeds(told["rollouts"], first=told.get("first_rollout_seed", 2_000_000)))
+    _check_types(content, Path(file))
+    cells = [cell for cell in _cells(content, Path(file)) if _wanted(cell, content.get("only", []))]
+    return Plan(cells, rollout_seeds(content["rollouts"], first=content.get("first_rollout_seed", 2_000_000)))
 
 
-def _check_types(told: dict[str, Any], file: Path) -> None:
-    """Raise ValueError where a name holds another kind of thing than the example above, or a rule names no property."""
-    seeds = told["seeds"]
-    usable = {
+def _check_types(content: dict[str, Any], file: Path) -> None:
+    seeds = content["seeds"]
+    checks = {
         "seeds": (isinstance(seeds, list) and all(type(seed) is int for seed in seeds), "a list of whole numbers"),
-        "rollouts": (type(told["rollouts"]) is int and told["rollouts"] > 0, "a number above 0"),
-        "first_rollout_seed": (type(told.get("first_rollout_seed", 0)) is int, "a whole number"),
+        "rollouts": (type(content["rollouts"]) is int and content["rollouts"] > 0, "a number above 0"),
+        "first_rollout_seed": (type(content.get("first_rollout_seed", 0)) is int, "a whole number"),
+        "settings": (isinstance(content.get("settings", {}), dict), "a table"),
     }
     for name in ("methods", "partitions"):
-        tables = told[name]
-        usable[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
-    usable["settings"] = (isinstance(told.get("settings", {}), dict), "a table")
-    for name, (fits, wanted) in usable.items():
+        tables = content[name]
+        checks[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
+    for name, (fits, wanted) in checks.items():
         if not fits:
-            raise ValueError(f"{file}: {name}={told[name]!r} is not usable: give {wanted}")
-    for rule in told.get("only", []):
+            raise ValueError(f"{file}: {name}={content[name]!r} is not usable: give {wanted}")
+    for rule in content.get("only", []):
         if unknown := sorted(set(rule) - set(RULES)):
             raise ValueError(f"{file}: unknown name {unknown[0]!r} under [[only]]: choose from {', '.join(RULES)}")
 
 
-def _cells(told: dict[str, Any], file: Path) -> Iterator[Cell]:
-    for seed in told["seeds"]:
-        for partition, of_partition in told["partitions"].items():
-            for method, of_method in told["methods"].items():
+def _cells(content: dict[str, Any], file: Path) -> Iterator[Cell]:
+    for seed in content["seeds"]:
+        for partition, of_partition in content["partitions"].items():
+            for method, of_method in content["methods"].items():
                 own = dict(of_method)
                 kind = own.pop("kind", "federated")
                 if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
                     raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
                 if kind not in KINDS:
                     raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
-                settings = QUIET | told.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(method, kind, partition, seed, from_profile(told.get("profile"), **settings))
+                settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
+                yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))
 
 
 def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:

@@ -1,4 +1,4 @@
-"""What an experiment left on disk -> tables: every rollout, every measured round, methods, differences of methods."""
+"""Read an experiment's run folders into tables: rollouts, rounds, a summary of methods, paired differences."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,21 +13,20 @@ from fedvla_lib.run_folder import GLOBAL
 
 OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
 OF_RUN = ("partition", "method", "run")
-# Settings that decide what demonstrations there are and which of them are held out.
+# Settings that determine the demonstrations and which of them are held out.
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
-SIDE_BY_SIDE = ("federated", "clients")  # kinds whose clients train at the same time
-ALONE = "local-only"  # the kind whose clients train for themselves
+PARALLEL = ("federated", "clients")  # kinds whose clients train in parallel
+LOCAL_ONLY = "local-only"
 HELD_OUT = ("loss", "action_error")
 P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
 
 def read_results(folder: Path) -> pd.DataFrame:
-    """Return a row for each rollout with the last model of each cell in `folder`, with what is known of the cell.
+    """Return a row for each rollout of the last model of each cell in `folder`, with columns that describe the cell.
 
-    train_s is NaN where a cell's stamp has no time of its training. steps_in_all and steps_in_a_row are the gradient
-    steps of the model that made the rollout. Where `counted` is True it counted them while it trained; cells of before
-    models counted have no counts, and there the numbers follow from the settings: of clients that trained alone, each
-    has its share of the total.
+    train_s is NaN if the stamp has no training time. steps_in_all and steps_in_a_row are gradient steps of the model
+    that made the rollout. `counted` tells whether they were counted while training; for older cells they are derived
+    from the settings, and a local-only client gets its share of the total.
 
     Raises:
         ValueError: there is no result.
@@ -42,10 +41,10 @@ def _cells(folder: Path) -> Iterator[Path]:
     yield from cells
 
 
-def _known(cell: Path) -> dict[str, Any]:
+def _cell_columns(cell: Path) -> dict[str, Any]:
     stamp = run_folder.read_stamp(cell)
-    known = {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"]}
-    return known | {"train_s": float("nan") if known["train_s"] is None else known["train_s"]}
+    train_s = float("nan") if stamp["train_s"] is None else stamp["train_s"]
+    return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], "train_s": train_s}
 
 
 def _rollouts(cell: Path) -> pd.DataFrame:
@@ -56,48 +55,48 @@ def _rollouts(cell: Path) -> pd.DataFrame:
     recording = ", ".join(str(getattr(config, name)) for name in RECORDING)
     rows = rows[rows["round"] == last["round"]]
     steps = _steps(run_folder.read_stamp(cell), config, rows)
-    return rows.assign(**_known(cell), **measured, **steps, recording=recording)
+    return rows.assign(**_cell_columns(cell), **measured, **steps, recording=recording)
 
 
 def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
-    """Columns counted, steps_in_all and steps_in_a_row: of the model that made each rollout."""
+    """Columns counted, steps_in_all and steps_in_a_row of the model that made each rollout."""
     counted = stamp.get("steps")
-    each = counted or {GLOBAL: _planned(stamp, config)}
-    alone = rows.client.map("client_{:.0f}".format) if "client" in rows else pd.Series(GLOBAL, rows.index)
-    names = [name if name in each else GLOBAL for name in alone]
-    of_model = {f"steps_{how}": [each[name][how] for name in names] for how in ("in_all", "in_a_row")}
-    return {"counted": counted is not None, **of_model}
+    by_model = counted or {GLOBAL: _planned(stamp, config)}
+    clients = rows.client.map("client_{:.0f}".format) if "client" in rows else pd.Series(GLOBAL, rows.index)
+    models = [name if name in by_model else GLOBAL for name in clients]
+    steps = {f"steps_{how}": [by_model[name][how] for name in models] for how in ("in_all", "in_a_row")}
+    return {"counted": counted is not None, **steps}
 
 
 def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
-    """The steps that the settings ask of each model of a cell that has no counts."""
+    """Gradient steps of each model of a cell, derived from the settings."""
     total = stamp["gradient_steps"]
-    if stamp["kind"] == "local-only":
+    if stamp["kind"] == LOCAL_ONLY:
         total //= config.num_clients
-    in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in SIDE_BY_SIDE else total
+    in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in PARALLEL else total
     return {"in_all": total, "in_a_row": in_a_row}
 
 
 def read_rounds(folder: Path) -> pd.DataFrame:
     """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
 
-    Columns: partition, method, run, round, steps (gradient steps of all clients up to there), loss, action_error, n,
-    successes, success_rate. Rounds that made no rollout have n = 0 and no rate. The last round was
-    measured with the rollouts of `read_results`, earlier ones with those of the training itself.
+    Columns: partition, method, run, round, steps (gradient steps of all clients so far), loss, action_error, n,
+    successes, success_rate. Rounds without rollouts have n = 0 and a NaN rate. The last round has the rollouts of
+    `read_results`, earlier rounds those that the run made while training.
 
     Raises:
-        ValueError: there is no result, or none of a federated cell.
+        ValueError: there is no result, or no federated cell.
     """
     tables = []
     for cell in _cells(folder):
-        known = _known(cell)
-        if known["kind"] == "federated":
+        columns = _cell_columns(cell)
+        if columns["kind"] == "federated":
             measured = run_folder.read_metrics(cell, "evaluate").set_index("round")[["loss", "action_error"]]
-            made = run_folder.read_metrics(cell, "rollout").groupby("round").success.agg(n="size", successes="sum")
-            rounds = measured.join(made).fillna({"n": 0, "successes": 0}).astype({"n": int, "successes": int})
-            steps = known["gradient_steps"] * rounds.index / rounds.index.max()
-            named = {key: known[key] for key in OF_RUN}
-            tables.append(rounds.assign(**named, steps=steps.astype(int)).reset_index())
+            counts = run_folder.read_metrics(cell, "rollout").groupby("round").success.agg(n="size", successes="sum")
+            rounds = measured.join(counts).fillna({"n": 0, "successes": 0}).astype({"n": int, "successes": int})
+            steps = columns["gradient_steps"] * rounds.index / rounds.index.max()
+            of_run = {key: columns[key] for key in OF_RUN}
+            tables.append(rounds.assign(**of_run, steps=steps.astype(int)).reset_index())
     if not tables:
         raise ValueError(f"no federated cell in {folder}: only those have rounds")
     table = pd.concat(tables, ignore_index=True)
@@ -105,14 +104,14 @@ def read_rounds(folder: Path) -> pd.DataFrame:
 
 
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> pd.DataFrame:
-    """Return a line for each group: seeds, rollouts, success with its interval, and what training took on average.
+    """Return a row for each group: seeds, rollouts, success with its interval, and the mean cost of training.
 
-    steps_in_all and steps_in_a_row are those of one model; gradient_steps, samples, MB and train_s those of all models
-    of a cell together, which are several where clients train alone.
+    steps_in_all and steps_in_a_row are per model; gradient_steps, samples, MB and train_s sum over the models of a
+    cell, of which local-only has one per client.
 
     Args:
         rows: of `read_results`.
-        by: columns that make a group; at least partition and method.
+        by: grouping columns; at least partition and method.
     """
     lines = []
     for group, part in rows.groupby(list(by), sort=False):
@@ -130,11 +129,11 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> 
 
 
 def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
-    """Return a line for each partition and pair of methods that both have: `compare.difference_over_seeds` of success.
+    """Return `statistics.difference_over_seeds` of success for each partition and pair of methods, a row each.
 
-    Only training seeds that both methods have are used. `loss` and `action_error` are differences of held-out averages,
-    with loss_low, loss_high and so on: Student's over training seeds. P-values come last; those of the table are one
-    family, and `p_holm` are Holm's (1979).
+    Only training seeds that both methods have are used. `loss` and `action_error` are differences of held-out averages
+    with Student's intervals over training seeds (loss_low, loss_high, ...). P-values come last; `p_holm` is corrected
+    over the table (Holm 1979).
     """
     lines = []
     for partition, part in rows.groupby("partition", sort=False):

@@ -1,8 +1,7 @@
-"""Search for settings across clients at a fixed budget of gradient steps, with Optuna.
+"""Hyperparameter search for federated runs at a fixed budget of gradient steps, with Optuna.
 
-Every trial spends the same steps. Settings are chosen by the held-out loss on one half of the validation episodes; what
-is reported of the winner, and of the settings that the search started from, comes from the other half and from rollouts
-that no trial has seen.
+Trials are selected by held-out loss on one half of the validation episodes. The winner and the settings that the search
+started from are reported on the other half and on rollouts that no trial used.
 """
 
 import json
@@ -27,25 +26,25 @@ from fedvla_lib.federation.nodes import TooFewReplies, draw_size
 from fedvla_lib.files import write_json
 from fedvla_lib.policy.model import Bundle
 
-# Not those of chapters; of the stored experiments comparison.toml and normalisation.toml have the same. Trials make no
-# rollouts, so none has chosen by them.
+# First rollout seed of reports. Not used by chapters; comparison.toml and normalisation.toml share it. Trials make no
+# rollouts, so these rollouts select nothing.
 ROLLOUTS_FROM = 3_000_000
 LOCAL_STEPS = (1, 2, 5, 10, 20)
-# A client whose loss is not finite raises, and the server gives up when too few replies can be used.
+# A client raises if its loss is not finite, and the server stops when too few replies are usable.
 DIVERGED = (FloatingPointError, TooFewReplies)
 SHARES = (0.1, 0.2, 0.4, 1.0)
 
 
 def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, Any]:
-    """Try `trials` settings, measure the best and the given ones, and return and write what was found.
+    """Run trials, measure the best and the given settings, and return and write the results.
+
+    A trial that diverges counts, without a loss.
 
     Args:
-        config: where the search starts; its total of gradient steps is the budget of each trial.
-        trials: how many settings to try, those of earlier calls with the same `out` included.
-        rollouts: rollouts at each task when the winner is measured.
-        out: folder for the journal of trials, from which a later call goes on, and for ``search.json``.
-
-    A trial that diverges counts as one of them, with no loss.
+        config: the settings to start from; their total of gradient steps is the budget of each trial.
+        trials: number of trials, including those of earlier calls with the same `out`.
+        rollouts: rollouts per task for the winner and the given settings.
+        out: folder for the journal of trials, which a later call resumes, and for ``search.json``.
 
     Raises:
         ValueError: fewer than one trial or two validation episodes, `out` holds a search with other settings, or every
@@ -58,18 +57,11 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
     if (count := len(splits.held_out_episodes(recordings.open_frames(config), config))) < 2:
         raise ValueError(
             f"val-fraction={config.val_fraction} leaves {count} validation episodes: a search needs 2 or more, half to "
-            "choose by and half to report on"
+            "select by and half to report on"
         )
-    study = _open(config, out)
-    todo = trials - len(study.get_trials(states=[TrialState.COMPLETE, TrialState.FAIL]))
-    study.optimize(
-        lambda trial: _selection_loss(suggest(trial, config)),
-        n_trials=max(0, todo), show_progress_bar=True, catch=DIVERGED,
-    )  # fmt: skip
-    if not study.get_trials(states=[TrialState.COMPLETE]):
-        raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
+    study = _run_trials(config, trials, out)
     ended = {"status": "completed", "code": methods.trained_by()}
-    found = {
+    result = {
         "budget": methods.total_steps(config),
         "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],
         "winner": study.best_params, "selection_loss": study.best_value,
@@ -77,26 +69,41 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
         "first_rollout_seed": ROLLOUTS_FROM, "config": asdict(given),
         "stamp": provenance.first_stamp(given, "search") | ended,
     }  # fmt: skip
-    write_json(out / "search.json", found)
-    return found
+    write_json(out / "search.json", result)
+    return result
+
+
+def _run_trials(config: Config, trials: int, out: Path) -> optuna.Study:
+    study = _open(config, out)
+    missing = trials - len(study.get_trials(states=[TrialState.COMPLETE, TrialState.FAIL]))
+
+    def selection_loss(trial: optuna.Trial) -> float:
+        tried = suggest(trial, config)
+        return _loss(methods.federated_policy(tried), tried, 0)
+
+    study.optimize(selection_loss, n_trials=max(0, missing), show_progress_bar=True, catch=DIVERGED)
+    if not study.get_trials(states=[TrialState.COMPLETE]):
+        raise ValueError(f"all {len(study.trials)} trials in {out} diverged: start from a lower lr than {config.lr}")
+    return study
 
 
 def suggest(trial: Any, config: Config) -> Config:
-    """Return the settings of a trial: rate, local steps, clients a round, and what the strategy has to be told."""
+    """Return the settings of a trial: learning rate, local steps, clients per round, strategy settings."""
     local_steps = trial.suggest_categorical("local_steps", LOCAL_STEPS)
     share = trial.suggest_categorical("fraction_train", SHARES)
     rate = trial.suggest_float("lr", 2e-4, 5e-3, log=True)
-    chosen = {"lr": rate, "local_steps": local_steps, "fraction_train": share}
+    settings = {"lr": rate, "local_steps": local_steps, "fraction_train": share}
     if config.strategy in ("fedavgm", "fedadam", "fedyogi"):
-        chosen["server_lr"] = trial.suggest_float("server_lr", 1e-3, 2.0, log=True)
+        settings["server_lr"] = trial.suggest_float("server_lr", 1e-3, 2.0, log=True)
     if config.strategy == "fedprox":
-        chosen["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
-    a_round = local_steps * draw_size(share, config.num_clients)
-    return check(replace(config, **chosen, num_server_rounds=max(1, methods.total_steps(config) // a_round)))
+        settings["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
+    steps_per_round = local_steps * draw_size(share, config.num_clients)
+    rounds = max(1, methods.total_steps(config) // steps_per_round)
+    return check(replace(config, **settings, num_server_rounds=rounds))
 
 
 def report(config: Config, rollouts: int) -> dict[str, Any]:
-    """Measure settings on what did not choose them: the other validation episodes, and rollouts."""
+    """Measure settings on data that did not select them: the other validation episodes, and rollouts."""
     bundle = methods.federated_policy(config)
     rows = roll_out(bundle, config, rollout_seeds(rollouts, first=ROLLOUTS_FROM))
     return {
@@ -105,12 +112,8 @@ def report(config: Config, rollouts: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _selection_loss(config: Config) -> float:
-    return _loss(methods.federated_policy(config), config, 0)
-
-
 def _loss(bundle: Bundle, config: Config, half: int) -> float:
-    """Held-out loss on every second validation episode, from the first or from the second on."""
+    """Held-out loss on every second validation episode, from the first (half 0) or the second (half 1)."""
     store = recordings.open_frames(config)
     episodes = splits.held_out_episodes(store, config)[half::2]
     return measure.measure(bundle, store, config, episode_ids=episodes).averages["loss"]
@@ -121,11 +124,13 @@ def _open(config: Config, out: Path) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = JournalStorage(JournalFileBackend(str(out / "trials.log")))
     study = optuna.create_study(storage=storage, study_name="search", load_if_exists=True)
-    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))  # not the same draws again
-    wanted = json.dumps(asdict(replace(config, data="", num_threads=0)))
-    if study.user_attrs.get("settings", wanted) != wanted:
+    study.sampler = optuna.samplers.TPESampler(
+        seed=config.seed + len(study.trials)
+    )  # a resumed search must not repeat its draws
+    settings = json.dumps(asdict(replace(config, data="", num_threads=0)))
+    if study.user_attrs.get("settings", settings) != settings:
         raise ValueError(f"{out} holds a search with other settings: give another folder")
-    study.set_user_attr("settings", wanted)
+    study.set_user_attr("settings", settings)
     return study
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fedvla_lib.data.augmentation import to_float
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY, Observation, image_key
 
@@ -72,7 +73,6 @@ def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
     """Convert a Gymnasium observation to a raw batch of size 1."""
     batch: dict[str, Any] = {"task": [instruction]}
     for camera, pixels in observation["pixels"].items():
-        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]  # (1, 3, H, W)
-        batch[image_key(camera)] = image.float() / 255
+        batch[image_key(camera)] = to_float(np.ascontiguousarray(pixels)[None])  # (1, 3, H, W)
     batch[STATE_KEY] = torch.from_numpy(np.asarray(observation["agent_pos"], np.float32))[None]  # (1, 6)
     return batch

@@ -1,6 +1,6 @@
-"""Local training of one policy: what a client does in a round, and what a training in one place does.
+"""The training loop of one policy, for a client's round and for centralized training.
 
-Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's own flow-matching loss with
+Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's flow-matching loss with
 padded actions masked.
 """
 
@@ -29,7 +29,7 @@ Parameters = Mapping[str, torch.nn.Parameter]
 
 
 class Correction(Protocol):
-    """Called after each backward pass, before clipping, with the trainable parameters by name."""
+    """Called with the trainable parameters by name after each backward pass, before gradient clipping."""
 
     def __call__(self, parameters: Parameters) -> None:
         """Change the gradients in place."""
@@ -37,55 +37,53 @@ class Correction(Protocol):
 
 WEIGHTS_FILE = "trainable.safetensors"
 LOSSES_FILE = "losses.json"
-
-
 Loss = Callable[[Bundle, dict[str, Any]], torch.Tensor]  # of a policy on a raw batch
 
 
 class TrainingBatches(Protocol):
-    """An endless, seekable supply of raw batches: `data.Batches`."""
+    """An endless, seekable stream of raw batches, such as `data.batches.Batches`."""
 
     seed: int
     num_examples: int
 
     def at(self, step: int) -> dict[str, Any]:
-        """Return the raw batch of a step; the same step gives the same batch."""
+        """Return the raw batch of a gradient step; the same step gives the same batch."""
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a client reports after local training."""
+    """Result of local training."""
 
-    losses: list[float]  # flow-matching loss of each step, in order
+    losses: list[float]  # flow-matching loss of each gradient step, in order
     num_examples: int  # training frames of the client: its weight in federated averaging
-    steps: int  # optimiser steps behind the weights, counted as they were done, those before a resume included
+    steps: int  # gradient steps as counted, including those before a resume
     seconds: float  # wall time of this call
-    moments: Arrays = field(default_factory=dict)  # the optimiser's state by name, for who goes on from here
+    moments: Arrays = field(default_factory=dict)  # optimiser state by name; empty unless `Start.moments` was given
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a call of `local_train` begins within a longer training."""
+    """Position of a call of `local_train` within a longer training."""
 
-    step: int = 0  # steps done in earlier rounds: the place in the data and in the learning-rate schedule
-    total_steps: int | None = None  # length of the schedule; None lets it end with the call
-    moments: Arrays | None = None  # optimiser state of an earlier result; {} starts fresh and still returns it
+    step: int = 0  # gradient steps of earlier rounds: position in the data and in the learning-rate schedule
+    total_steps: int | None = None  # length of the schedule; None ends it with the call
+    moments: Arrays | None = None  # optimiser state of an earlier result; {} starts fresh and returns the state
 
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """Where ``step_NNNNNN`` folders go, every `config.checkpoint_every` steps and at the end."""
+    """Write ``step_NNNNNN`` folders every `config.checkpoint_every` gradient steps and at the end."""
 
     folder: Path
-    resume: bool = False  # continue from the newest one; the result is bit for bit the same
+    resume: bool = False  # continue from the newest one; the result is bit-identical
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised."""
+    """The loss, and a correction of its gradient."""
 
-    loss: Loss | None = None  # None: the policy's own flow-matching loss
-    correction: Correction | None = None  # changes each gradient before it is clipped: FedProx, SCAFFOLD
+    loss: Loss | None = None  # None: the policy's flow-matching loss
+    correction: Correction | None = None  # applied before clipping: FedProx, SCAFFOLD
 
 
 FRESH, FLOW_MATCHING = Start(), Objective()
@@ -102,10 +100,10 @@ def local_train(
     objective: Objective = FLOW_MATCHING,
     progress: bool = True,
 ) -> TrainResult:
-    """Train the policy's trainable parameters in place for `steps` optimiser steps.
+    """Train the policy's trainable parameters in place for `steps` gradient steps.
 
     Raises:
-        FloatingPointError: the loss is no longer finite; the checkpoints so far stay.
+        FloatingPointError: the loss is not finite; checkpoints so far are kept.
     """
     torch.set_num_threads(granted_threads(config))
     began, loss = time.perf_counter(), objective.loss or flow_loss
@@ -129,11 +127,7 @@ def local_train(
 
 
 def _step(
-    bundle: Bundle,
-    loss: torch.Tensor,
-    optimizer: torch.optim.Optimizer,
-    scheduler: Any,
-    correction: Correction | None = None,
+    bundle: Bundle, loss: torch.Tensor, optimizer: torch.optim.Optimizer, scheduler: Any, correction: Correction | None
 ) -> float:
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
@@ -146,7 +140,7 @@ def _step(
 
 
 def flow_loss(bundle: Bundle, batch: dict[str, Any]) -> torch.Tensor:
-    """The policy's own loss, or the same from a stored prefix; noise and time are drawn alike in both."""
+    """The policy's loss, from a cached prefix if the batch has one; noise and time are sampled alike in both cases."""
     if PREFIX_KEY not in batch:
         return bundle.policy.forward(bundle.preprocess(batch))[0]
     model, settings = bundle.policy.model, bundle.policy.config
@@ -165,26 +159,21 @@ def _moments(bundle: Bundle, optimizer: torch.optim.Optimizer) -> Arrays:
 
 
 def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arrays) -> None:
-    """Put the optimiser where `_moments` found it."""
+    """Restore the optimiser state that `_moments` returned."""
     named = trainable(bundle.policy)
     for key, value in moments.items():
         name, kind = key.rsplit("|", 1)
-        device = "cpu" if kind == "step" else named[name].device  # PyTorch keeps the count of steps on the CPU
+        device = "cpu" if kind == "step" else named[name].device  # PyTorch keeps the step count on the CPU
         optimizer.state[named[name]][kind] = torch.from_numpy(value.copy()).to(device)
 
 
 def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
-    """SmolVLA's AdamW and cosine-with-warm-up presets, at the run's rate and length, standing at `start_step`."""
+    """SmolVLA's AdamW and cosine-with-warm-up presets with the run's learning rate and length, at `start_step`."""
     settings = bundle.policy.config
     optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
-    floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of last to peak rate
-    preset = replace(
-        settings.get_scheduler_preset(),
-        peak_lr=config.lr,
-        decay_lr=floor,
-        num_warmup_steps=config.warmup_steps,
-        num_decay_steps=total_steps,
-    )
+    floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of final to peak rate
+    schedule = {"num_warmup_steps": config.warmup_steps, "num_decay_steps": total_steps}
+    preset = replace(settings.get_scheduler_preset(), peak_lr=config.lr, decay_lr=floor, **schedule)
     scheduler = preset.build(optimizer, total_steps)
     scheduler.last_epoch = start_step
     for group in optimizer.param_groups:
@@ -193,14 +182,14 @@ def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int
 
 
 def learning_rates(bundle: Bundle, config: Config, *, steps: int) -> list[float]:
-    """Return the learning rate of each step of a training of `steps` steps."""
+    """Return the learning rate of each gradient step of a training of `steps` steps."""
     _, scheduler = _optimizer(bundle, config, 0, steps)
     return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
 
 
 @contextmanager
 def _seeded(seed: int, start_step: int) -> Iterator[None]:
-    """Draw noise and flow time from (seed, start_step) and leave the caller's random state as it was."""
+    """Seed noise and flow time by (seed, start_step) and restore the caller's random state."""
     before = get_rng_state()
     set_seed(int(np.random.SeedSequence([seed, start_step]).generate_state(1)[0]))
     try:
@@ -214,7 +203,7 @@ def _is_due(done: int, steps: int, every: int) -> bool:
 
 
 def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[float], folder: Path) -> None:
-    """Write ``step_NNNNNN`` whole or not at all: weights, optimiser, schedule, random state, losses."""
+    """Write ``step_NNNNNN`` atomically: weights, optimiser, schedule, random state, losses."""
     with new_folder(folder / f"step_{len(losses):06d}", replace=True) as draft:
         save_training_state(draft, len(losses), optimizer, scheduler)
         weights = {name: p.detach().contiguous() for name, p in trainable(bundle.policy).items()}
@@ -223,21 +212,21 @@ def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[flo
 
 
 def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, checkpoints: Checkpoints | None) -> list[float]:
-    """Load the newest checkpoint in place and return the losses so far; an empty list when there is none to resume."""
-    found = sorted(Path(checkpoints.folder).glob("step_*")) if checkpoints and checkpoints.resume else []
-    if not found:
+    """Load the newest checkpoint in place and return its losses; an empty list if there is none to resume."""
+    folders = sorted(Path(checkpoints.folder).glob("step_*")) if checkpoints and checkpoints.resume else []
+    if not folders:
         return []
-    load_training_state(found[-1], optimizer, scheduler)
-    saved = load_file(found[-1] / WEIGHTS_FILE)
-    own = trainable(bundle.policy)
-    if set(saved) != set(own):
-        raise ValueError(f"{found[-1]} holds {len(saved)} trainable arrays, the policy has {len(own)}: another setup")
+    newest = folders[-1]
+    load_training_state(newest, optimizer, scheduler)
+    saved, parameters = load_file(newest / WEIGHTS_FILE), trainable(bundle.policy)
+    if set(saved) != set(parameters):
+        raise ValueError(f"{newest} holds {len(saved)} trainable arrays, the policy has {len(parameters)}")
     with torch.no_grad():
-        for name, parameter in own.items():
+        for name, parameter in parameters.items():
             parameter.copy_(saved[name])
-    return json.loads((found[-1] / LOSSES_FILE).read_text())
+    return json.loads((newest / LOSSES_FILE).read_text())
 
 
-def with_gradient(parameters: Parameters, known: Container[str]) -> list[tuple[str, torch.nn.Parameter]]:
-    """Parameters to correct: not those that a backward pass did not reach, nor those that stay with the client."""
-    return [(name, p) for name, p in parameters.items() if p.grad is not None and name in known]
+def with_gradient(parameters: Parameters, shared: Container[str]) -> list[tuple[str, torch.nn.Parameter]]:
+    """Parameters to correct: those in `shared` (not personal to the client) that the backward pass reached."""
+    return [(name, p) for name, p in parameters.items() if p.grad is not None and name in shared]
