@@ -1,4 +1,4 @@
-"""Batches mean what LeRobot means, depend on seed and step only, and statistics see the given episodes only."""
+"""Batches equal LeRobot's and depend on seed and step only; statistics use the given episodes only."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ CHUNK = 8
 
 
 def episode_table(per_task: int, tasks: tuple[str, ...] = ("lift", "place", "push")) -> pd.DataFrame:
-    """As a recording has it: the tasks alternate."""
+    """Return the table of a recording: the tasks alternate."""
     count = per_task * len(tasks)
     return pd.DataFrame({"episode_id": range(count), "task": [tasks[i % len(tasks)] for i in range(count)]})
 
@@ -75,7 +75,7 @@ def test_statistics_are_of_the_given_episodes_only(store):
         np.testing.assert_array_equal(found[key]["min"], inside.min(axis=0))
         np.testing.assert_array_equal(found[key]["max"], inside.max(axis=0))
         assert found[key]["count"] == len(rows)
-        assert not np.allclose(found[key]["mean"], values.mean(axis=0)), "the other episodes would have shown"
+        assert not np.allclose(found[key]["mean"], values.mean(axis=0)), "the other episodes would change the mean"
 
 
 @pytest.mark.integration
@@ -146,7 +146,7 @@ def test_an_epoch_visits_every_frame_once_in_an_order_of_its_own(store):
     for epoch in visited:
         np.testing.assert_array_equal(np.sort(epoch), frame_rows(store, [0, 3]))
     assert not np.array_equal(visited[0], visited[1])
-    over_the_end = count // 7  # this batch holds the end of one epoch and the start of the next
+    over_the_end = count // 7  # this batch spans two epochs
     assert torch.equal(
         batches.at(over_the_end)[STATE_KEY], torch.from_numpy(store.states[visited.ravel()[7 * over_the_end :][:7]])
     )
@@ -178,12 +178,12 @@ def test_augmentation_changes_pictures_only_and_a_little(store):
 def test_a_shift_moves_the_picture_and_repeats_the_edge():
     from fedvla_lib.data.augmentation import _shift
 
-    picture = np.tile(np.arange(50, dtype=np.uint8)[None, :, None, None], (6, 1, 50, 3))  # brightness = line
-    shifted = _shift(picture, np.random.default_rng(0)).astype(int)
+    image = np.tile(np.arange(50, dtype=np.uint8)[None, :, None, None], (6, 1, 50, 3))  # brightness = row
+    shifted = _shift(image, np.random.default_rng(0)).astype(int)
     steps = shifted[:, 25, 0, 0] - 25
     assert (np.abs(steps) <= 2).all() and len(set(steps)) > 1
-    for image, step in zip(shifted, steps, strict=True):
-        np.testing.assert_array_equal(image[:, 0, 0], np.clip(np.arange(50) + step, 0, 49))
+    for one, step in zip(shifted, steps, strict=True):
+        np.testing.assert_array_equal(one[:, 0, 0], np.clip(np.arange(50) + step, 0, 49))
 
 
 # --- where the data comes from --------------------------------------------------------------------------------------

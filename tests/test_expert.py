@@ -1,4 +1,4 @@
-"""The demonstrators succeed, and their demonstrations are fit to be imitated: short, smooth, without pauses."""
+"""The experts succeed, and their demonstrations are suitable for imitation: short, smooth, without pauses."""
 
 from itertools import pairwise
 
@@ -66,7 +66,7 @@ def test_inverse_kinematics_reaches_the_waypoints():
         np.testing.assert_allclose(env.data.site(GRASP_SITE).xpos, target.position_m, atol=2e-3)
 
 
-# --- the success predicates against a real arm that does almost the right thing
+# --- success predicates when the arm does almost the right thing
 
 
 def test_a_cube_held_over_the_square_is_not_placed():
@@ -78,7 +78,7 @@ def test_a_cube_held_over_the_square_is_not_placed():
         action = expert.act(observation)
         observation, _, terminated, *_ = env.step(action)
         assert not terminated
-    for _ in range(30):  # keep holding the cube, which now stands in the square
+    for _ in range(30):  # keep holding the cube in the square
         *_, terminated, truncated, _ = env.step(action)
         assert not terminated
         if truncated:
@@ -86,7 +86,7 @@ def test_a_cube_held_over_the_square_is_not_placed():
 
 
 def end_after_doing(asked: str, done: str) -> float:
-    """Ask for one task, let the expert do another; metres from the cube to the zone's centre in the end."""
+    """Let the expert do a task other than the one asked for; return the final distance from cube to zone in metres."""
     env, expert = blind(asked), Expert()
     env.reset(seed=0)
     env.task = done
@@ -100,7 +100,7 @@ def end_after_doing(asked: str, done: str) -> float:
 
 
 def test_a_cube_carried_into_the_circle_is_not_pushed():
-    assert end_after_doing("push", "place") < 0.02  # and yet it lies there
+    assert end_after_doing("push", "place") < 0.02  # although it is there
 
 
 def test_a_cube_pushed_into_the_square_is_not_placed():

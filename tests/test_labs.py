@@ -1,4 +1,4 @@
-"""Laboratories from recording to rollout: told apart in the data, dealt to clients, and met again in evaluation."""
+"""Labs from recording to evaluation: stored in the data, assigned to clients, and used in rollouts."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def test_a_recording_says_in_which_laboratory_each_episode_was_made(store):
 def test_laboratories_look_different_and_report_other_angles(store):
     first = store.images["overhead"][store.episodes.start.to_numpy()].astype(float)
     means = np.array([first[(store.episodes.lab == k).to_numpy()].mean(axis=(0, 1, 2)) for k in range(3)])
-    assert np.abs(np.diff(means, axis=0)).max() > 2  # grey levels, between the average pictures of two laboratories
+    assert np.abs(np.diff(means, axis=0)).max() > 2  # grey levels, between the mean images of two labs
 
 
 @pytest.mark.parametrize("num_clients", [2, 3, 6])
@@ -77,5 +77,5 @@ def test_an_evaluation_visits_the_laboratories_in_turn(store):
     rows = rollouts.evaluate(actor, ["lift"], [1, 2, 3], image_size=64, labs=there, progress=False)
     assert [row["lab"] for row in rows] == [there[1].name, there[0].name, there[1].name]
     again = rollouts.evaluate(actor, ["lift"], [2], image_size=64, labs=there, progress=False)
-    assert again[0]["lab"] == rows[1]["lab"]  # a seed means the same scene in whatever company it is run
+    assert again[0]["lab"] == rows[1]["lab"]  # a seed gives the same scene whichever seeds run beside it
     assert again[0]["action_smoothness"] == pytest.approx(rows[1]["action_smoothness"], rel=1e-4)

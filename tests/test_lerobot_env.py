@@ -1,4 +1,4 @@
-"""LeRobot's own tools find the environment, feed a policy from it and read its success."""
+"""LeRobot's tools find the environment, run a policy in it and read its success."""
 
 import json
 import os
@@ -87,7 +87,7 @@ def test_an_unknown_task_is_named_with_the_valid_ones():
 
 @pytest.mark.slow
 def test_lerobot_eval_runs_a_saved_policy(tmp_path):
-    """The command of the documentation, on a nano SmolVLA with random weights."""
+    """The documented command, with a nano SmolVLA with random weights."""
     config = from_profile("tiny", base="nano-random", num_threads=1)
     stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY, ACTION_KEY)}
     model.save_policy(model.load_policy(config, stats), tmp_path / "policy")

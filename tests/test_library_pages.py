@@ -88,7 +88,7 @@ def test_a_described_function_links_to_its_chapter_and_its_room_and_equations_ha
     assert 'href="architecture.html#room-evaluation"' in page
     described = page[page.index('id="fedvla_lib.evaluation.video.read_video"') :]
     assert re.search(r'In the book: <a class="reference internal" href="notebooks/one.html"', described)
-    assert "readable video" in described
+    assert "uint8 (T, H, W, 3)" in described
 
 
 @pytest.mark.unit

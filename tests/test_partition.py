@@ -1,4 +1,4 @@
-"""Every scheme deals out every episode exactly once; the measure of heterogeneity means what it says."""
+"""Every scheme assigns each episode exactly once; the measure of heterogeneity follows its definition."""
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ TASKS = ("lift", "place", "push")
 
 
 def episode_table(per_task: int, tasks: tuple[str, ...] = TASKS) -> pd.DataFrame:
-    """As a recording has it: the tasks alternate, episodes of a task have one length."""
+    """Return the table of a recording: the tasks alternate, episodes of a task have the same length."""
     count = per_task * len(tasks)
     names = [tasks[i % len(tasks)] for i in range(count)]
     frames, labs = [30 + len(name) for name in names], [i // len(tasks) % 4 for i in range(count)]

@@ -1,4 +1,4 @@
-"""A recording is a LeRobot data set at every moment, whatever interrupts it, and the same in the end."""
+"""A recording is a valid LeRobot data set at every moment; interruptions do not change the result."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, FPS, JOINT_NAMES, STATE_K
 from fedvla_lib.robot.tasks import task_of
 
 SIZE = 32
-NUM_PUTS = 7  # files that publishing one episode moves into place: two videos, rows, metadata, and three shared ones
+NUM_PUTS = 7  # files published per episode: two videos, rows, metadata, and three shared ones
 
 
 def lerobot_opens(root: Path) -> LeRobotDataset:
@@ -47,7 +47,7 @@ def made_up_episode(index: int, length: int = 5) -> Episode:
 
 
 def write(root: Path, until: int) -> None:
-    """Bring the made-up recording in `root` to `until` episodes."""
+    """Extend the made-up recording in `root` to `until` episodes."""
     done = _num_recorded(root)
     recorder = episode_writer.EpisodeWriter(root, {"image_size": SIZE, "num_labs": 1}, done)
     try:
@@ -58,9 +58,9 @@ def write(root: Path, until: int) -> None:
 
 
 def contents(root: Path) -> dict[str, object]:
-    """Everything a reader can see: tables as tables, the rest as bytes."""
+    """Return all files: tables as tables, the rest as bytes."""
     paths = [path for part in ("meta", "data", "videos") for path in (root / part).rglob("*") if path.is_file()]
-    assert not [path for path in paths if path.name.startswith(".")], "half-written files are left over"
+    assert not [path for path in paths if path.name.startswith(".")], "incomplete files are left"
     return {
         str(path.relative_to(root)): pq.read_table(path) if path.suffix == ".parquet" else path.read_bytes()
         for path in paths
@@ -68,7 +68,7 @@ def contents(root: Path) -> dict[str, object]:
 
 
 def assert_same(root: Path, whole: Path) -> None:
-    """Compare two recordings byte by byte, and say what differs in terms of rows and pixels."""
+    """Compare two recordings file by file and report the columns or frames that differ."""
     found, wanted = contents(root), contents(whole)
     assert sorted(found) == sorted(wanted)
     different = [name for name in sorted(wanted) if found[name] != wanted[name]]
@@ -76,7 +76,7 @@ def assert_same(root: Path, whole: Path) -> None:
 
 
 def difference(path: Path, other: Path) -> str:
-    """What a reader of a failed test needs: the columns or the frames in which two files differ."""
+    """Describe the columns or frames in which two files differ."""
     if path.suffix == ".parquet":
         found, wanted = pq.read_table(path), pq.read_table(other)
         return f"columns {[name for name in wanted.column_names if not found[name].equals(wanted[name])]}"
@@ -102,7 +102,7 @@ def test_lerobot_reads_back_what_the_expert_did(recording):
     assert {row["task"] for row in rows} == {episode.instruction}
     for camera in CAMERAS:
         seen = np.stack([row[image_key(camera)].permute(1, 2, 0) for row in rows]) * 255
-        assert np.abs(seen - episode.images[camera]).mean() < 3, "H.264 costs a few grey levels, not more"
+        assert np.abs(seen - episode.images[camera]).mean() < 3, "H.264 changes at most a few grey levels"
 
 
 @pytest.mark.integration
@@ -167,7 +167,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
 
 @pytest.mark.integration
 def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same_result(tmp_path, monkeypatch):
-    """Publishing moves several files per episode; stop before each of them in turn, during the second episode."""
+    """Publishing writes several files per episode; interrupt before each of them in turn, in the second episode."""
     write(tmp_path / "whole", 3)
     move = episode_writer._put
     for survived in range(NUM_PUTS):
@@ -194,18 +194,18 @@ def test_dying_at_any_moment_of_publishing_leaves_complete_episodes_and_the_same
 
 @pytest.mark.unit
 def test_x264_is_kept_from_its_code_whose_bits_vary(tmp_path):
-    """It names what it uses of the processor in its log."""
+    """x264 logs the CPU capabilities that it uses."""
     av.logging.set_level(av.logging.INFO)
     try:
-        with av.logging.Capture() as log, av.open(str(tmp_path / "film.mp4"), "w") as film:
-            stream = film.add_stream("h264", FPS, options=episode_writer._encoder().get_codec_options(1, True))
+        with av.logging.Capture() as log, av.open(str(tmp_path / "video.mp4"), "w") as video:
+            stream = video.add_stream("h264", FPS, options=episode_writer._encoder().get_codec_options(1, True))
             stream.width, stream.height, stream.pix_fmt = SIZE, SIZE, "yuv444p"
-            film.mux(stream.encode(av.VideoFrame(SIZE, SIZE, "yuv444p")))
-            film.mux(stream.encode())
+            video.mux(stream.encode(av.VideoFrame(SIZE, SIZE, "yuv444p")))
+            video.mux(stream.encode())
     finally:
         av.logging.set_level(None)
-    said = "".join(line for _, _, line in log)
-    assert "using cpu capabilities" in said and "AVX512" not in said and "error" not in said.lower()
+    text = "".join(line for _, _, line in log)
+    assert "using cpu capabilities" in text and "AVX512" not in text and "error" not in text.lower()
 
 
 @pytest.mark.integration

@@ -1,4 +1,4 @@
-"""One loop for recording and evaluation: what it returns is what the actor saw and did."""
+"""The control loop: an episode holds what the actor observed and did."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SIZE = 32
 
 
 class Stubborn:
-    """An actor that wants one posture, and remembers what it was shown."""
+    """An actor with one fixed target, which stores its observations."""
 
     def __init__(self, target):
         self.target = target
@@ -28,7 +28,7 @@ class Stubborn:
 
 
 class Glancer(Expert):
-    """An expert that looks up at every eighth step, as a policy does at each chunk."""
+    """An expert that reads the images at every eighth step, as a policy does once per chunk."""
 
     def reset(self, env, seed):
         super().reset(env, seed)
@@ -50,7 +50,7 @@ def test_episode_holds_what_the_actor_saw_when_it_acted(env):
     actor = Stubborn(HOME)
     episode = run_episode(env, actor, seed=7)
     assert actor.seed == episode.seed == 7
-    assert episode.num_frames == len(actor.seen) == 80  # the horizon: this actor never succeeds
+    assert episode.num_frames == len(actor.seen) == 80  # the horizon, since this actor never succeeds
     assert episode.duration_s == 80 / FPS
     assert not episode.success
     for time in (0, 40, 79):
@@ -85,20 +85,23 @@ def test_same_seed_same_episode_with_or_without_pictures(env):
 def test_without_cameras_an_actor_sees_the_moment_at_which_it_looks(env):
     actor = Glancer()
     blind = run_episode(So100Env("lift", SIZE, cameras=()), actor, seed=3)
-    filmed = run_episode(env, Expert(), seed=3)
-    np.testing.assert_array_equal(blind.actions, filmed.actions)
-    assert blind.images == {} and len(actor.looks) == -(-filmed.num_frames // 8)
-    for look, pictures in enumerate(actor.looks):
+    recorded = run_episode(env, Expert(), seed=3)
+    np.testing.assert_array_equal(blind.actions, recorded.actions)
+    assert blind.images == {} and len(actor.looks) == -(-recorded.num_frames // 8)
+    for look, images in enumerate(actor.looks):
         for camera in CAMERAS:
-            np.testing.assert_array_equal(pictures[camera], filmed.images[camera][8 * look])
+            np.testing.assert_array_equal(images[camera], recorded.images[camera][8 * look])
 
 
-def test_what_is_not_filmed_is_drawn_only_where_the_actor_looks_and_ends_the_same(tmp_path, monkeypatch):
+def test_without_a_video_images_are_rendered_only_when_the_actor_reads_them_and_the_result_is_the_same(
+    tmp_path, monkeypatch
+):
     drawn, draw = [], So100Env.camera_images
     monkeypatch.setattr(So100Env, "camera_images", lambda sim, *names: drawn.append(sim) or draw(sim, *names))
     whole = evaluate(Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "all", progress=False)
+    first = tmp_path / "first"
     some = evaluate(
-        Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=tmp_path / "first", films=1, progress=False
+        Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, videos_dir=first, num_videos=1, progress=False
     )
     drawn.clear()
     none = evaluate(Glancer(), ["lift", "place"], [1, 2], image_size=SIZE, progress=False)
@@ -110,7 +113,7 @@ def test_what_is_not_filmed_is_drawn_only_where_the_actor_looks_and_ends_the_sam
 
 
 def test_replaying_the_actions_repeats_the_episode(env):
-    """A recording is complete: seed and actions are enough to see it again."""
+    """Seed and actions are enough to reproduce an episode."""
     episode = run_episode(env, Expert(), seed=5)
     observation, _ = env.reset(seed=5)
     for state, action in zip(episode.states, episode.actions, strict=True):

@@ -1,4 +1,4 @@
-"""The simulated arm: Gymnasium's contract, determinism, units, honest success predicates, and a renderer that lasts."""
+"""The simulated arm: Gymnasium's API, determinism, units, success predicates and rendering."""
 
 import gc
 import multiprocessing
@@ -44,13 +44,13 @@ def blind(task: str) -> So100Env:
 
 
 def task_text(layout, task: str) -> str:
-    """The first wording of a task, with this layout's colours."""
+    """Return the first wording of a task with this layout's colours."""
     colors = [cube.color for cube in layout.cubes]
     return TASKS[task].wordings[0].format(color=colors[0], other=colors[-1])
 
 
 def wander(env: So100Env, seed: int, steps: int = 12) -> list[np.ndarray]:
-    """Everything observed under random targets near the start."""
+    """Return everything observed under random targets near the start pose."""
     rng = np.random.default_rng(1)
     observation, _ = env.reset(seed=seed)
     seen = [observation]
@@ -62,7 +62,7 @@ def wander(env: So100Env, seed: int, steps: int = 12) -> list[np.ndarray]:
 
 
 def wait(env: So100Env, steps: int = 60) -> bool:
-    """Hold the arm where it is; whether the task counted as fulfilled meanwhile."""
+    """Hold the arm still; return whether the task succeeded meanwhile."""
     target = env.joints
     for _ in range(steps):
         *_, terminated, truncated, _ = env.step(target)
@@ -76,7 +76,7 @@ def set_cube(env: So100Env, xyz_m, velocity_mps=(0.0, 0.0, 0.0)) -> None:
     env.data.joint("cube").qvel[:3] = velocity_mps
 
 
-# --- Gymnasium's contract
+# --- Gymnasium's API
 
 
 def test_gymnasium_accepts_the_environment(task):
@@ -110,13 +110,13 @@ def test_without_cameras_there_are_no_pixels_and_the_same_motion():
     assert unseeing.render() is None
 
 
-# --- determinism and chance
+# --- determinism and randomness
 
 
 def test_same_seed_same_trajectory_and_pixels(task):
     env = So100Env(task, image_size=SIZE)
     first = wander(env, seed=5)
-    wander(env, seed=6)  # what came before must not matter
+    wander(env, seed=6)  # earlier episodes must not matter
     for again in (wander(env, seed=5), wander(So100Env(task, image_size=SIZE), seed=5)):
         for one, other in zip(first, again, strict=True):
             np.testing.assert_array_equal(one, other)
@@ -153,7 +153,7 @@ def test_layouts_stay_in_their_regions_and_use_every_color(task):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_each_camera_shows_where_the_cube_is(camera):
-    """The centre of the cube's pixels moves with the cube, in both directions of the table."""
+    """The centroid of the cube's pixels moves with the cube, in both directions of the table."""
     env = So100Env("lift", image_size=96)
     env.reset(seed=0, options={"color": "blue"})
     centres = []
@@ -235,11 +235,11 @@ def test_observations_share_no_memory_with_the_simulation():
     np.testing.assert_array_equal(env.joints, before)
 
 
-# --- success means success
+# --- success predicates
 
 
 def scene(**changes) -> TaskState:
-    """A cube at rest on the zone's centre, nothing near it."""
+    """The state of a cube at rest on the zone's centre, with the arm away from it."""
     calm = dict(clearance_m=0.0, peak_clearance_m=0.0, speed_mps=0.0, zone_offset_m=(0.0, 0.0), held=False,
                 touched=False, carried=False, flung=False, hand_distance_m=0.1)  # fmt: skip
     return TaskState(**{**calm, **changes})
@@ -335,12 +335,12 @@ def test_a_cube_that_an_episode_lacks_is_not_seen():
         pixels = env.reset(seed=seed)[0]["pixels"]["overhead"].astype(int)
         seen = sum(bool((pixels @ axis > 160).sum() > 5) for axis in ((2, -1, -1), (-1, 2, -1), (-1, -1, 2)))
         counts.add(len(env.layout.cubes))
-        orange = 1  # the arm is red enough to pass for a red cube
+        orange = 1  # the orange arm counts as a red cube
         assert seen - orange <= len(env.layout.cubes)
     assert counts == {1, 2}
 
 
-# --- laboratories
+# --- labs
 
 
 def test_a_laboratory_changes_what_is_seen_and_nothing_that_moves():
@@ -354,7 +354,7 @@ def test_a_laboratory_changes_what_is_seen_and_nothing_that_moves():
     target = HOME + 3
     for _ in range(10):
         here.step(target)
-        there.step(target + there.joint_offset)  # the same place, in the other arm's own degrees
+        there.step(target + there.joint_offset)  # the same pose, in the angles that the other arm reports
     np.testing.assert_allclose(here.data.qpos, there.data.qpos, atol=1e-6)
 
 
@@ -395,7 +395,7 @@ def test_a_cube_knocked_into_the_circle_is_not_pushed():
     way_m = np.subtract(env.layout.zone_xy_m, env.cube_m[:2])
     set_cube(env, env.cube_m, (*(1.5 * way_m / np.linalg.norm(way_m)), 0.0))
     assert not wait(env)
-    assert np.linalg.norm(env.cube_m[:2] - env.layout.zone_xy_m) < PUSH_RADIUS_M - 0.02  # and yet it lies inside
+    assert np.linalg.norm(env.cube_m[:2] - env.layout.zone_xy_m) < PUSH_RADIUS_M - 0.02  # although it is inside
 
 
 def test_a_cube_that_was_never_carried_is_not_placed():
@@ -448,7 +448,7 @@ def test_bad_colors_and_tasks_are_named():
         check_tasks(["lift", "juggle"])
 
 
-# --- words
+# --- instructions
 
 
 def test_instructions_lead_back_to_their_task():
@@ -461,7 +461,7 @@ def test_instructions_lead_back_to_their_task():
     assert task_of("Fold the towel.") == "Fold the towel."
 
 
-# --- drawing
+# --- rendering
 
 
 def test_frames_survive_the_end_of_another_environment():
@@ -479,14 +479,14 @@ def test_frames_survive_the_end_of_another_environment():
     gc.collect()
     np.testing.assert_array_equal(env.render(), before)
     env.close()
-    np.testing.assert_array_equal(env.render(), before)  # and closing is not the end
+    np.testing.assert_array_equal(env.render(), before)  # rendering reopens a closed renderer
 
 
 def test_an_environment_that_nobody_holds_is_gone_at_once():
     env = So100Env("lift", image_size=SIZE)
     env.reset(seed=0)
     seen = weakref.ref(env)
-    gc.disable()  # which would come later, and in whichever thread
+    gc.disable()  # a collection would come later, in any thread
     try:
         del env
         assert seen() is None
@@ -495,7 +495,7 @@ def test_an_environment_that_nobody_holds_is_gone_at_once():
 
 
 def test_the_end_of_another_environment_in_the_middle_of_drawing_is_put_off(monkeypatch):
-    """Python may collect what is left of one between the choice of an OpenGL context and its use."""
+    """Python may collect an environment between making an OpenGL context current and using it."""
     env, other = (So100Env("lift", image_size=SIZE) for _ in range(2))
     env.reset(seed=0), other.reset(seed=1)
     before, context = env.render(), env._renderer._gl_context
@@ -503,7 +503,7 @@ def test_the_end_of_another_environment_in_the_middle_of_drawing_is_put_off(monk
 
     def choose_and_allocate():
         choose()
-        assert len([[] for _ in range(10_000)]) == 10_000  # so many would set off a collection
+        assert len([[] for _ in range(10_000)]) == 10_000  # enough to trigger a collection
 
     other.myself, gone = other, weakref.ref(other)
     del other
@@ -521,21 +521,21 @@ def test_pictures_are_not_blank():
         assert half.std() > 20
 
 
-@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
+@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="needs Linux without a display")
 def test_a_fresh_process_draws_without_being_told_how_and_exits_quietly():
     code = "from fedvla_lib.robot.sim import So100Env; print(*So100Env(image_size=16).reset(seed=0)[0]['pixels'])"
-    untold = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=untold)
+    unset = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=unset)
     assert (done.returncode, done.stdout.split()) == (0, list(CAMERAS)), done.stderr
     assert "Exception ignored" not in done.stderr
 
 
-@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="about Linux without a display")
+@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="needs Linux without a display")
 @pytest.mark.parametrize(("driver", "first"), [("off", "numpy"), ("", "mujoco")])
 def test_drawing_that_cannot_work_says_what_to_set(driver, first):
     code = f"import {first}; from fedvla_lib.robot.sim import So100Env; So100Env(image_size=16).reset(seed=0)"
-    mute = {**os.environ, "MUJOCO_GL": driver}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=mute)
+    environment = {**os.environ, "MUJOCO_GL": driver}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=environment)
     message = done.stderr.strip().splitlines()[-1]
     assert message.startswith(f"RuntimeError: cannot render off screen with MUJOCO_GL={driver!r}"), done.stderr
     assert "set MUJOCO_GL to egl, osmesa or glfw before mujoco is first imported" in message

@@ -1,4 +1,4 @@
-"""Any SO-100 data set of the format opens, decoded once; a broken one is refused by file and episode."""
+"""Any SO-100 data set of the format opens and is decoded once; errors of a broken one name file and episode."""
 
 import json
 import os
@@ -112,7 +112,7 @@ def test_a_build_that_died_is_made_again(recording, store, tmp_path, monkeypatch
 def write_foreign(root: Path, *, cameras: tuple[str, ...] = ("top", "wrist"), names: list[str] = OLD_NAMES) -> None:
     """Two episodes of 7 and 5 frames at 30 Hz, 48 x 64 pixels, in one file each, as LeRobot records by default.
 
-    Picture t of episode e is flat grey, 10 * t + 100 * e.
+    Image t of episode e is uniform grey, 10 * t + 100 * e.
     """
     joints = {"dtype": "float32", "shape": (len(names),), "names": names}
     video = {"dtype": "video", "shape": (48, 64, 3), "names": ["height", "width", "channels"]}
@@ -123,14 +123,14 @@ def write_foreign(root: Path, *, cameras: tuple[str, ...] = ("top", "wrist"), na
     )  # fmt: skip
     for episode, length in enumerate((7, 5)):
         for step in range(length):
-            picture = np.full((48, 64, 3), 10 * step + 100 * episode, np.uint8)
+            image = np.full((48, 64, 3), 10 * step + 100 * episode, np.uint8)
             values = np.full(len(names), step, np.float32)
             frame = {
                 STATE_KEY: values,
                 ACTION_KEY: values + 1,
                 "task": ("Stack the blocks.", "Lift the red cube.")[episode],
             }
-            dataset.add_frame({**frame, **{image_key(name): picture for name in cameras}})
+            dataset.add_frame({**frame, **{image_key(name): image for name in cameras}})
         dataset.save_episode()
     dataset.finalize()
 
@@ -176,15 +176,15 @@ def test_pictures_inside_the_table_open_too(tmp_path):
     image = {"dtype": "image", "shape": (16, 16, 3), "names": ["height", "width", "channels"]}
     features = {STATE_KEY: joints, ACTION_KEY: dict(joints), image_key("top"): image}
     dataset = LeRobotDataset.create("someone/images", 10, features, root=tmp_path / "data", use_videos=False)
-    pictures = np.random.default_rng(0).integers(0, 255, (4, 16, 16, 3), dtype=np.uint8)
-    for picture in pictures:
+    images = np.random.default_rng(0).integers(0, 255, (4, 16, 16, 3), dtype=np.uint8)
+    for pixels in images:
         values = np.zeros(6, np.float32)
-        dataset.add_frame({STATE_KEY: values, ACTION_KEY: values, image_key("top"): picture, "task": "Wait."})
+        dataset.add_frame({STATE_KEY: values, ACTION_KEY: values, image_key("top"): pixels, "task": "Wait."})
     dataset.save_episode()
     dataset.finalize()
     store = open_store(tmp_path / "data", image_size=16, progress=False)
     assert list(store.images) == ["overhead"], "one camera is enough"
-    np.testing.assert_array_equal(store.images["overhead"], pictures)
+    np.testing.assert_array_equal(store.images["overhead"], images)
 
 
 @pytest.mark.unit
@@ -195,7 +195,7 @@ def test_a_wide_picture_keeps_its_aspect():
     assert (square.max(axis=(1, 2)) > 0).sum() == 5
 
 
-# --- what is not there ----------------------------------------------------------------------------------------------
+# --- missing data sets ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.unit
@@ -239,7 +239,7 @@ def edit_info(root: Path, change: Callable[[dict], object]) -> None:
 
 
 def shorten_video(path: Path, keep: int, fps: int | None = None) -> None:
-    """Encode the first `keep` frames again, at another rate if wanted."""
+    """Re-encode the first `keep` frames, at `fps` if given."""
     with av.open(str(path)) as container:
         rate = fps or container.streams.video[0].average_rate
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)][:keep]

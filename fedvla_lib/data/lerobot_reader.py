@@ -8,6 +8,7 @@ import io
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -288,17 +289,9 @@ def _decode(path: Path, fps: float, episode_id: int) -> Iterator[tuple[int, np.n
         rate = float(stream.average_rate or 0)
         if abs(rate - fps) > FPS_TOLERANCE * fps:
             raise DataError(f"{path}, episode {episode_id}: has {rate:g} frames per second, meta/info.json says {fps}")
-        yield from _decode_stream(container, stream, fps)
-
-
-def _decode_stream(container: Any, stream: Any, fps: float) -> Iterator[tuple[int, np.ndarray]]:
-    frames = container.decode(stream)
-    while True:
-        try:
-            frame = next(frames)
-        except (StopIteration, av.FFmpegError):
-            return  # the caller reports the frames that are missing
-        yield round(float(frame.pts * stream.time_base) * fps), frame.to_ndarray(format="rgb24")
+        with suppress(av.FFmpegError):  # the caller reports the frames that are missing
+            for frame in container.decode(stream):
+                yield round(float(frame.pts * stream.time_base) * fps), frame.to_ndarray(format="rgb24")
 
 
 def _still_images(

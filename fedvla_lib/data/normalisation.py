@@ -42,13 +42,8 @@ def identity_stats() -> Stats:
 
 def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
     values = values.astype(np.float64)
-    return {
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "count": np.array([len(values)]),
-    }
+    stats = {name: getattr(values, name)(axis=0) for name in ("mean", "std", "min", "max")}
+    return stats | {"count": np.array([len(values)])}
 
 
 def common_statistics(config: Config, pooled: Stats) -> Stats:

@@ -5,7 +5,7 @@ between waypoints is smooth, so that demonstrations have no jumps or pauses and 
 and the joint positions.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -25,6 +25,7 @@ FORK = 13.0  # gripper command at which both finger tips push one face of the cu
 FORK_GAP_M = 0.040  # distance from the cube's centre at which the fork comes down
 FORK_CONTACT_M = 0.022  # distance while pushing
 GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
+STACK_HEIGHT_M = GRASP_HEIGHT_M + 2 * CUBE_HALF_M
 PUSH_HEIGHT_M = 0.018
 HOVER_HEIGHT_M = 0.075
 CARRY_HEIGHT_M = 0.080
@@ -191,19 +192,6 @@ def _lift_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     return [*path, _move(path[-1], (*layout.cube_xy_m, LIFT_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
 
 
-def _place_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M)
-
-
-def _push_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m))
-
-
-def _stack_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    upper, lower = layout.cubes
-    return _carry(start, upper, lower.xy_m, GRASP_HEIGHT_M + 2 * CUBE_HALF_M)
-
-
 def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     path: list[Waypoint] = []
     for cube, zone_xy_m in zip(layout.cubes, layout.zones_xy_m, strict=True):
@@ -211,16 +199,8 @@ def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     return path
 
 
-def _reach_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cube_yaw_rad, OPEN)]
-
-
 def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
-
-
-def _grip_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return _grasp(start, layout.cubes[0])
 
 
 def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
@@ -265,8 +245,17 @@ def _cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
     return float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))
 
 
-PLANS = {
-    "lift": _lift_plan, "place": _place_plan, "push": _push_plan, "stack": _stack_plan, "sort": _sort_plan,
-    "reach": _reach_plan, "grip": _grip_plan, "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan,
-    "point_square": _point_plan, "point_circle": _point_plan,
-}  # fmt: skip
+PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
+    "lift": _lift_plan,
+    "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M),
+    "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m)),
+    "stack": lambda layout, start: _carry(start, layout.cubes[0], layout.cubes[1].xy_m, STACK_HEIGHT_M),
+    "sort": _sort_plan,
+    "reach": lambda layout, start: [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cube_yaw_rad, OPEN)],
+    "grip": lambda layout, start: _grasp(start, layout.cubes[0]),
+    "drag": _drag_plan,
+    "pull": _pull_plan,
+    "nudge": _nudge_plan,
+    "point_square": _point_plan,
+    "point_circle": _point_plan,
+}

@@ -55,15 +55,11 @@ def draw_lab(name: str, rng: np.random.Generator, spread: float = 1.0, offsets: 
         camera_shift_m=_rows(spread * rng.normal(0, CAMERA_SHIFT_M, (len(CAMERAS), 3))),
         look_shift_m=_rows(spread * rng.normal(0, LOOK_SHIFT_M, (len(CAMERAS), 3))),
         brightness=float(1 + spread * (rng.uniform(*BRIGHTNESS) - 1)),
-        table_change=_row(spread * rng.uniform(-TABLE_CHANGE, TABLE_CHANGE, 3)),
-        paint_change=_row(spread * rng.uniform(-PAINT_CHANGE, PAINT_CHANGE, 3)),
-        joint_offset_deg=_row(offset_deg if offsets else 0 * offset_deg),
+        table_change=tuple((spread * rng.uniform(-TABLE_CHANGE, TABLE_CHANGE, 3)).tolist()),
+        paint_change=tuple((spread * rng.uniform(-PAINT_CHANGE, PAINT_CHANGE, 3)).tolist()),
+        joint_offset_deg=tuple((offset_deg if offsets else 0 * offset_deg).tolist()),
     )
 
 
 def _rows(values: np.ndarray) -> tuple[Vector, ...]:
-    return tuple(_row(row) for row in values)
-
-
-def _row(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
+    return tuple(map(tuple, values.tolist()))

@@ -140,7 +140,7 @@ class So100Env(gymnasium.Env):
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
         cubes = scene.cubes_of(self.model)[: len(self.layout.cubes)]
-        self._histories = [_CubeHistory(_point(self.data.body(name).xpos)) for name in cubes]
+        self._histories = [_CubeHistory(tuple(self.data.body(name).xpos.tolist())) for name in cubes]
         self._needs_reset = False
         return self._observation(), self._info()
 
@@ -206,8 +206,8 @@ class So100Env(gymnasium.Env):
     def _measure(self, index: int, touched_in_step: set[str]) -> TaskState:
         """Update the history of one cube and return the input of the success predicates."""
         name, history = scene.CUBES[index], self._histories[index]
-        parts = self._touching(name)
-        cube_m, hand_m = _point(self.data.body(name).xpos), _point(self.data.site(scene.GRASP_SITE).xpos)
+        parts, cube_m = self._touching(name), tuple(self.data.body(name).xpos.tolist())
+        hand_m = tuple(self.data.site(scene.GRASP_SITE).xpos.tolist())
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
         history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
@@ -287,10 +287,6 @@ def from_radians(angles_rad: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:
     closed, opened = limits_rad[-1]
     gripper = 100 * (angles_rad[-1] - closed) / (opened - closed)
     return np.append(np.rad2deg(angles_rad[:-1]) + ZERO_DEG, gripper).astype(np.float32)
-
-
-def _point(xyz_m: np.ndarray) -> tuple[float, float, float]:
-    return tuple(float(value) for value in xyz_m)
 
 
 def _check_joints(values: np.ndarray, what: str) -> np.ndarray:

@@ -9,13 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 JOINT_NAMES = (
-    "shoulder_pan.pos",
-    "shoulder_lift.pos",
-    "elbow_flex.pos",
-    "wrist_flex.pos",
-    "wrist_roll.pos",
-    "gripper.pos",
-)
+    "shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "wrist_roll.pos", "gripper.pos",
+)  # fmt: skip
 JOINT_UNITS = ("deg", "deg", "deg", "deg", "deg", "0-100")
 NUM_JOINTS = len(JOINT_NAMES)
 CAMERAS = ("overhead", "front")
