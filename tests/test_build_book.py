@@ -249,7 +249,7 @@ def test_the_front_page_says_what_the_stored_comparison_found():
     in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
     assert f"After {in_all} gradient steps in all" in said and f"has walked {in_a_row} steps in a row" in said
     assert set(stored.partition) <= set(build_book.DEALT)
-    gaps = results.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
+    gaps = tables.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
         words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
         assert words in said.split("Federated minus pooled: ")[1].split("\n")[0]

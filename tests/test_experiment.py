@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import faulty
+from fedvla_book import tables
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, task_names
@@ -237,7 +238,7 @@ def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tm
     file.write_text("\n".join(lines))
     assert main(["experiment", str(file), "--out", str(out)]) == 0
     rounds = run_folder.read_metrics(out / "mixed_averaged_0", "evaluate")
-    curve = results.read_rounds(out)
+    curve = tables.read_rounds(out)
     assert list(curve["round"]) == [0, 1, 2] and list(curve.n) == [2, 2, 4] and curve.steps.iloc[-1] == 8
     assert list(rounds["round"]) == [0, 1, 2] and rounds.success_rate[:2].notna().all() and rounds.loss.notna().all()
     cells = [str(out / name) for name in ("mixed_pooled_0", "mixed_averaged_0")]
@@ -268,7 +269,7 @@ def test_differences_use_the_seeds_that_both_methods_have_and_are_corrected_toge
         for partition in ("iid", "task") for method, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
         for seed in range(40) if not (method == "shared" and run == 3)
     ]  # fmt: skip
-    found = results.differences(pd.DataFrame(lines), [("shared", "pooled")], seed=0)
+    found = tables.differences(pd.DataFrame(lines), [("shared", "pooled")], seed=0)
     assert list(found.partition) == ["iid", "task"] and list(found.seeds) == [3, 3] and list(found.n) == [120, 120]
     assert (found.high < 0).all() and (found.p_holm >= found.p_value).all()
     assert found.loss.tolist() == pytest.approx([-0.04, -0.04])

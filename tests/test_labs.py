@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from fedvla_book import tables
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation, partition, recordings, splits
 from fedvla_lib.data.frame_store import open_store
@@ -48,8 +49,8 @@ def test_clients_get_laboratories(store, num_clients):
     assert all(len(one) == (1 if num_clients >= 3 else held.index(one) == 0 and 2 or 1) for one in held)
     mixes = [store.episodes.set_index("episode_id").task[part].value_counts() for part in parts]
     assert all(mix["lift"] == mix["push"] for mix in mixes)
-    assert partition.heterogeneity(parts, store.episodes)["total_variation"] == 0
-    assert partition.heterogeneity(parts, store.episodes, by="lab")["total_variation"] > 0.3
+    assert tables.heterogeneity(parts, store.episodes)["total_variation"] == 0
+    assert tables.heterogeneity(parts, store.episodes, by="lab")["total_variation"] > 0.3
 
 
 def test_whoever_trains_on_a_recording_later_means_the_same_laboratories(store):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+from fedvla_book import tables
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import recordings, splits
 from fedvla_lib.data.batches import Batches
@@ -77,13 +78,13 @@ def test_averaging_a_and_b_apart_is_wrong_unless_a_is_shared():
 
     alike = rng.normal(size=(2, 3))
     shared = [client(alike) for _ in range(3)]
-    assert lora.averaging_error(shared, [0.5, 0.3, 0.2])["m"] < 1e-6
+    assert tables.averaging_error(shared, [0.5, 0.3, 0.2])["m"] < 1e-6
     one, other = client(rng.normal(size=(2, 3))), client(rng.normal(size=(2, 3)))
     products = [u["m" + lora.B] @ u["m" + lora.A] for u in (one, other)]
     right = (products[0] + products[1]) / 2
     apart = (one["m" + lora.B] + other["m" + lora.B]) / 2 @ (one["m" + lora.A] + other["m" + lora.A]) / 2
     expected = np.linalg.norm(right - apart) / np.linalg.norm(right)
-    assert lora.averaging_error([one, other], [0.5, 0.5])["m"] == pytest.approx(expected, rel=1e-5)
+    assert tables.averaging_error([one, other], [0.5, 0.5])["m"] == pytest.approx(expected, rel=1e-5)
     assert expected > 0.1
 
 

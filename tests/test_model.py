@@ -11,6 +11,7 @@ import torch
 from lerobot.policies.smolvla import SmolVLAPolicy
 from safetensors.torch import load_file, save_file
 
+from fedvla_book import tables
 from fedvla_lib.config import from_profile
 from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
@@ -80,7 +81,7 @@ def test_actions_come_out_in_the_units_of_the_statistics():
 def test_what_trains_is_what_the_config_says(freeze, expert_only, trained):
     config = replace(CONFIG, freeze_vision_encoder=freeze, train_expert_only=expert_only)
     policy = model.load_policy(config, STATS).policy
-    rows = {row["module"].rsplit(".", 1)[-1]: row for row in model.module_table(policy)}
+    rows = {row["module"].rsplit(".", 1)[-1]: row for row in tables.module_table(policy)}
     assert (rows["vision_model"]["trainable"] > 0) == ("vision" in trained)
     assert (rows["text_model"]["trainable"] > 0) == ("text" in trained)
     assert rows["lm_expert"]["trainable"] == rows["lm_expert"]["parameters"] > 0

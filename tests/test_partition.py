@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from fedvla_book.tables import heterogeneity
 from fedvla_lib.config import PARTITIONS
-from fedvla_lib.data.partition import check_partition, heterogeneity, partition
+from fedvla_lib.data.partition import check_partition, partition
 
 pytestmark = pytest.mark.unit
 TASKS = ("lift", "place", "push")

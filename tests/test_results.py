@@ -180,5 +180,5 @@ def test_a_folder_without_federated_cells_is_named(tmp_path):
     (tmp_path / "task_pooled_0").mkdir()
     (tmp_path / "task_pooled_0" / "stamp.json").write_text(json.dumps(known))
     with pytest.raises(ValueError, match="no federated cell") as caught:
-        results.read_rounds(tmp_path)
+        tables.read_rounds(tmp_path)
     assert str(tmp_path) in str(caught.value) and len(str(caught.value).splitlines()) == 1

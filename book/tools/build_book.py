@@ -387,7 +387,7 @@ def _at_equal_total(of_method: pd.DataFrame) -> list[str]:
 
 
 def _gaps(rows: pd.DataFrame) -> str:
-    found = results.differences(rows, [(FEDERATED, POOLED)], seed=0).set_index("partition")
+    found = tables.differences(rows, [(FEDERATED, POOLED)], seed=0).set_index("partition")
     gaps = [_gap(words, found.loc[name]) for name, words in DEALT.items() if name in found.index]
     return f"Federated minus pooled: {'; '.join(gaps)}."
 

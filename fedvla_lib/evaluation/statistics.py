@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm, permutation_test, t
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.proportion import confint_proportions_2indep, proportion_confint
+from statsmodels.stats.proportion import proportion_confint
 
 CONFIDENCE = 0.95
 POWER = 0.8
@@ -105,19 +105,6 @@ def success_difference(
         "visible": smallest_difference(len(left), (only_left + only_right) / len(left), confidence),
         "only_left": only_left, "only_right": only_right, "p_value": float(mcnemar(table, exact=True).pvalue),
     }  # fmt: skip
-
-
-def unpaired_difference(
-    left: tuple[int, int], right: tuple[int, int], confidence: float = CONFIDENCE
-) -> tuple[float, float]:
-    """Interval of left - right, two success rates of which only (successes, rollouts) are known.
-
-    If both made the same rollouts, `paired_difference` is usually narrower, but needs the outcome of each.
-
-    Source: Newcombe 1998, Statistics in Medicine 17, 873-890, method 10 (combines Wilson's intervals).
-    """
-    low, high = confint_proportions_2indep(*left, *right, method="newcomb", alpha=1 - confidence)
-    return float(low), float(high)
 
 
 def mean_difference(

@@ -1,6 +1,6 @@
 """Read an experiment's run folders into tables: rollouts, rounds, a summary of methods, paired differences."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ from fedvla_lib.evaluation import statistics
 from fedvla_lib.run_folder import GLOBAL
 
 OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
-OF_RUN = ("partition", "method", "run")
 # Settings that determine the demonstrations and which of them are held out.
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
 PARALLEL = ("federated", "clients")  # kinds whose clients train in parallel
@@ -31,17 +30,17 @@ def read_results(folder: Path) -> pd.DataFrame:
     Raises:
         ValueError: there is no result.
     """
-    return pd.concat([_rollouts(cell) for cell in _cells(folder)], ignore_index=True)
+    return pd.concat([_rollouts(cell) for cell in cell_folders(folder)], ignore_index=True)
 
 
-def _cells(folder: Path) -> Iterator[Path]:
+def cell_folders(folder: Path) -> Iterator[Path]:
     cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
     if not cells:
         raise ValueError(f"no results in {folder}: make some with fedvla experiment")
     yield from cells
 
 
-def _cell_columns(cell: Path) -> dict[str, Any]:
+def cell_columns(cell: Path) -> dict[str, Any]:
     stamp = run_folder.read_stamp(cell)
     train_s = float("nan") if stamp["train_s"] is None else stamp["train_s"]
     return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], "train_s": train_s}
@@ -55,7 +54,7 @@ def _rollouts(cell: Path) -> pd.DataFrame:
     recording = ", ".join(str(getattr(config, name)) for name in RECORDING)
     rows = rows[rows["round"] == last["round"]]
     steps = _steps(run_folder.read_stamp(cell), config, rows)
-    return rows.assign(**_cell_columns(cell), **measured, **steps, recording=recording)
+    return rows.assign(**cell_columns(cell), **measured, **steps, recording=recording)
 
 
 def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
@@ -75,32 +74,6 @@ def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
         total //= config.num_clients
     in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in PARALLEL else total
     return {"in_all": total, "in_a_row": in_a_row}
-
-
-def read_rounds(folder: Path) -> pd.DataFrame:
-    """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
-
-    Columns: partition, method, run, round, steps (gradient steps of all clients so far), loss, action_error, n,
-    successes, success_rate. Rounds without rollouts have n = 0 and a NaN rate. The last round has the rollouts of
-    `read_results`, earlier rounds those that the run made while training.
-
-    Raises:
-        ValueError: there is no result, or no federated cell.
-    """
-    tables = []
-    for cell in _cells(folder):
-        columns = _cell_columns(cell)
-        if columns["kind"] == "federated":
-            measured = run_folder.read_metrics(cell, "evaluate").set_index("round")[["loss", "action_error"]]
-            counts = run_folder.read_metrics(cell, "rollout").groupby("round").success.agg(n="size", successes="sum")
-            rounds = measured.join(counts).fillna({"n": 0, "successes": 0}).astype({"n": int, "successes": int})
-            steps = columns["gradient_steps"] * rounds.index / rounds.index.max()
-            of_run = {key: columns[key] for key in OF_RUN}
-            tables.append(rounds.assign(**of_run, steps=steps.astype(int)).reset_index())
-    if not tables:
-        raise ValueError(f"no federated cell in {folder}: only those have rounds")
-    table = pd.concat(tables, ignore_index=True)
-    return table.assign(success_rate=table.successes / table.n.where(table.n > 0))
 
 
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> pd.DataFrame:
@@ -126,34 +99,3 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> 
             "samples": cells.samples.mean(), "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
         })  # fmt: skip
     return pd.DataFrame(lines)
-
-
-def differences(rows: pd.DataFrame, pairs: Iterable[tuple[str, str]], *, seed: int) -> pd.DataFrame:
-    """Return `statistics.difference_over_seeds` of success for each partition and pair of methods, a row each.
-
-    Only training seeds that both methods have are used. `loss` and `action_error` are differences of held-out averages
-    with Student's intervals over training seeds (loss_low, loss_high, ...). P-values come last; `p_holm` is corrected
-    over the table (Holm 1979).
-    """
-    lines = []
-    for partition, part in rows.groupby("partition", sort=False):
-        for method, other in pairs:
-            shared = set(part[part.method == method].run) & set(part[part.method == other].run)
-            if len(shared) > 1:
-                both = part[part.run.isin(shared)]
-                found = statistics.difference_over_seeds(both, method, other, seed=seed)
-                lines.append({"partition": partition, "seeds": len(shared), **found, **_held_out(both, method, other)})
-    if not lines:
-        return pd.DataFrame()
-    table = pd.DataFrame(lines)
-    table = table.assign(p_holm=statistics.holm(table.p_value))
-    return table[[name for name in table if name not in P_VALUES] + P_VALUES]
-
-
-def _held_out(rows: pd.DataFrame, method: str, other: str) -> dict[str, float]:
-    found = {}
-    for name in HELD_OUT:
-        each = rows.groupby(["method", "run"])[name].first()
-        over = statistics.over_seeds((each[method] - each[other]).to_frame())
-        found |= {name: over["difference"], f"{name}_low": over["low"], f"{name}_high": over["high"]}
-    return found

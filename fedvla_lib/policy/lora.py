@@ -6,9 +6,7 @@ al. 2024, https://arxiv.org/abs/2403.12313).
 """
 
 import copy
-from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.lora import LoraLayer
@@ -53,25 +51,6 @@ def merged(policy: torch.nn.Module) -> torch.nn.Module:
             parent, _, child = name.rpartition(".")
             setattr(result.get_submodule(parent), child, module.get_base_layer())
     return result
-
-
-def averaging_error(updates: Sequence[Mapping[str, np.ndarray]], weights: Sequence[float]) -> dict[str, float]:
-    """Return, for each adapted matrix, the relative error of averaging A and B separately.
-
-    Args:
-        updates: adapters of each client by name.
-        weights: of the clients, summing to 1.
-
-    Returns:
-        ||sum_k p_k B_k A_k - (sum_k p_k B_k)(sum_k p_k A_k)|| / ||sum_k p_k B_k A_k||, Frobenius norms, by name.
-    """
-    errors = {}
-    for name in [key.removesuffix(B) for key in updates[0] if key.endswith(B)]:
-        pairs = [(update[name + B].astype(float), update[name + A].astype(float)) for update in updates]
-        exact = sum(p * b @ a for p, (b, a) in zip(weights, pairs, strict=True))
-        averaged = [sum(p * pair[i] for p, pair in zip(weights, pairs, strict=True)) for i in (0, 1)]
-        errors[name] = float(np.linalg.norm(exact - averaged[0] @ averaged[1]) / max(np.linalg.norm(exact), 1e-30))
-    return errors
 
 
 def adapters(policy: torch.nn.Module) -> Arrays:

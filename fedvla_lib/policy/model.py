@@ -86,29 +86,6 @@ def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
     return {name: array for name, array in arrays.items() if layer_of(name) in parts}
 
 
-def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
-    """Return one row per part of the model: module, its plain name, parameters and trainable parameters."""
-    rows = []
-    for prefix, part in MODULES.items():
-        sizes = {p: p.numel() for name, p in policy.named_parameters() if name.startswith(prefix)}
-        trained = sum(size for p, size in sizes.items() if p.requires_grad)
-        rows.append({"module": prefix, "part": part, "parameters": sum(sizes.values()), "trainable": trained})
-    return rows
-
-
-MODULES = {
-    "model.vlm_with_expert.vlm.model.vision_model": "vision encoder",
-    "model.vlm_with_expert.vlm.model.connector": "connector (pixel shuffle + projection)",
-    "model.vlm_with_expert.vlm.model.text_model": "language model",
-    "model.vlm_with_expert.vlm.lm_head": "language head (unused by the policy)",
-    "model.vlm_with_expert.lm_expert": "action expert",
-    "model.state_proj": "state projection",
-    "model.action_in_proj": "action input projection",
-    "model.action_out_proj": "action output projection",
-    "model.action_time_mlp": "action-time MLP",
-}
-
-
 def save_policy(bundle: Bundle, folder: Path) -> None:
     """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, with adapters merged.
 

@@ -1,0 +1,45 @@
+"""Tables that the pages of the book show, made from stored results and from what chapters trained.
+
+One file a subject; chapters use all of them through this package.
+"""
+
+from fedvla_book.tables.checkpoints import clear_pairs, correlations, disagreements
+from fedvla_book.tables.clients import heterogeneity
+from fedvla_book.tables.grids import (
+    OF_RUN,
+    OTHER,
+    OWN,
+    at_own_task,
+    beside_own_tasks,
+    by_steps,
+    differences,
+    fill_in,
+    read_rounds,
+    repeat_partition_free,
+    unpaired_difference,
+)
+from fedvla_book.tables.model import averaging_error, module_table
+from fedvla_book.tables.searches import SEARCHED, compared, read_searches
+
+__all__ = [
+    "OF_RUN",
+    "OTHER",
+    "OWN",
+    "SEARCHED",
+    "at_own_task",
+    "averaging_error",
+    "beside_own_tasks",
+    "by_steps",
+    "clear_pairs",
+    "compared",
+    "correlations",
+    "differences",
+    "disagreements",
+    "fill_in",
+    "heterogeneity",
+    "module_table",
+    "read_rounds",
+    "read_searches",
+    "repeat_partition_free",
+    "unpaired_difference",
+]
