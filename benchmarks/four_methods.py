@@ -94,7 +94,7 @@ def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
 
 
 def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
-    """Say how far federated is ahead of an method, with interval; a pair is a task and a start in one run."""
+    """Say how far federated is ahead of a method, with interval; a pair is a task and a start in one run."""
     both = pd.concat([counted["federated"], counted[name].assign(method=name)])
     paired = both.assign(task=both.run.astype(str) + both.task)
     result = paired_difference(paired, "federated", name, seed=0)
@@ -102,7 +102,7 @@ def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
 
 
 def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
-    """Say how many models of an method succeeded less often than the federated model of their run."""
+    """Say how many models of a method succeeded less often than the federated model of their run."""
     rates, ours = part.groupby(["run", "method"]).success.mean(), federated.groupby("run").success.mean()
     return f"{sum(rate < ours[run] for (run, _), rate in rates.items())} of {len(rates)}"
 

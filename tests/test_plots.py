@@ -390,7 +390,7 @@ def test_client_drift_draws_every_local_phase_and_the_averages():
 
 def test_methods_and_clients_have_one_colour_each():
     assert len({plots.method_color(method) for method in plots.METHOD_COLORS}) == len(plots.METHOD_COLORS)
-    for figure in (plots.curves, plots.grouped_bars):  # wherever an method stands among others
+    for figure in (plots.curves, plots.grouped_bars):  # wherever a method stands among others
         table = pd.DataFrame({"other": [1.0, 2.0], "centralized": [1.0, 2.0]})
         ax = figure(table, xlabel="x", ylabel="y")
         found = ax.lines[1].get_color() if ax.lines else matplotlib.colors.to_hex(ax.patches[2].get_facecolor())

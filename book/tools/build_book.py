@@ -52,7 +52,12 @@ FILM = b"<!-- film -->"  # on the front page: the federated policy in this build
 FILMED_IN = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
 OUTCOME = "book/_static/outcome.png"  # the figure of it
-FEDERATED, POOLED, ALONE, LONGER = "fedavg-200x2x2", "centralized", "local-only", "local-only-800"  # methods it tells of
+FEDERATED, POOLED, ALONE, LONGER = (
+    "fedavg-200x2x2",
+    "centralized",
+    "local-only",
+    "local-only-800",
+)  # methods it tells of
 NEARLY_SOLVED = 0.8  # success of labs alone above which their tasks leave little for a federation to add
 DEALT = {"iid": "the same mix of tasks in every lab", "dirichlet-0_5": "uneven mixes (Dirichlet, 0.5)",
          "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task a lab",
@@ -397,8 +402,7 @@ def _with_its_share(of_method: pd.DataFrame) -> list[str]:
     return [
         f"A lab alone with only its share of the steps, {alone.steps_in_all:,.0f}, succeeds in {_rate_of(alone)} of "
         f"{alone.rollouts:,} rollouts over {alone.seeds} training seeds.",
-        "It was judged on all tasks, most of which it never saw: "
-        "this number is no measure of what a lab can do alone.",
+        "It was judged on all tasks, most of which it never saw: this number is no measure of what a lab can do alone.",
     ]
 
 
@@ -436,7 +440,7 @@ def _outcome_figure(of_method: pd.DataFrame) -> str:
     once = f" Of one training seed, with intervals for other rollouts only: {', '.join(few)}." if few else ""
     return (
         f"```{{figure}} {Path(OUTCOME).relative_to('book').as_posix()}\n"
-        ":alt: Points with intervals, one row an method with the gradient steps of its model: success rates of the base, "
+        ":alt: Points with intervals, one row a method with the gradient steps of its model: success rates of the base, "
         "of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
         ":width: 100%\n\n"
         "Success of each method with one task a lab, and the gradient steps of one model of it. Of labs alone, rollouts "
@@ -537,7 +541,10 @@ def render(source: Path, output: Path) -> Path:
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
     options = ["-W", "-n", "--keep-going", "--quiet"]
     # Where site_scripts.py lies, and the library whose functions are described.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")]),
+    }
     # Warnings are on stderr.
     built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
     if built.returncode:

@@ -27,7 +27,9 @@ rollouts = 3
 num_clients = 3
 [partitions.task]
 partition = "task"
-""" + "".join(f'[METHODS.{kind}]\nkind = "{kind}"\n' for kind in ("base", "federated", "centralized", "local-only", "clients"))
+""" + "".join(
+    f'[METHODS.{kind}]\nkind = "{kind}"\n' for kind in ("base", "federated", "centralized", "local-only", "clients")
+)
 RUN = ["--profile", "tiny", "--seed", "3"]
 COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the folder of command X
     "record": ["record", "--profile", "tiny", "--task", "lift", "--task", "push", "--episodes", "2", "--out", "{D}/data"],
@@ -53,10 +55,23 @@ COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the fol
 } | {f"{name} --help": [name, "--help"] for name in ("record", "pretrain", "experts", "config", "train", "run", "deploy",
      "superlink", "credentials", "evaluate", "experiment", "search", "compare", "videos", "doctor")}  # fmt: skip
 MASKS = [
-    (r"\b\d{8}_\d{6}(_\d+)?\b", "TIME"), (r"\b\d+(\.\d+)? (s|seconds|GiB|MB)\b", "N \\2"), (r"\d+%\|.*", "BAR"),
+    (r"(?<!\d)\d{8}_\d{6}(_\d{6})?(?!\d)", "TIME"), (r"\b\d+(\.\d+)? (s|seconds|GiB|MB)\b", "N \\2"), (r"\d+%\|.*", "BAR"),
     (r"process \d+", "process N"), (r"127\.0\.0\.1:\d+", "ADDRESS"), (r" +", " "),
 ]  # fmt: skip
-FLEETING = {"time", "seconds", "video", "wall_s", "train_s", "started", "commit", "code", "stamp", "bytes", "data", "out"}
+FLEETING = {
+    "time",
+    "seconds",
+    "video",
+    "wall_s",
+    "train_s",
+    "started",
+    "commit",
+    "code",
+    "stamp",
+    "bytes",
+    "data",
+    "out",
+}
 
 
 def behaviour(tree: Path, folder: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
@@ -98,7 +113,18 @@ def _masked(text: str, folder: Path, tree: Path) -> str:
         text = text.replace(str(path), "DIR")
     for pattern, word in MASKS:
         text = re.sub(pattern, word, text)
-    return text
+    return _without_times(text)
+
+
+def _without_times(text: str) -> str:
+    """Printed tables without their columns of seconds."""
+    lines, column, width = [], None, 0
+    for line in text.splitlines():
+        words = line.split()
+        if fleeting := {"seconds", "train_s"} & set(words):
+            column, width = words.index(fleeting.pop()), len(words)
+        lines.append(" ".join(words[:column] + words[column + 1 :]) if column and len(words) == width else line)
+    return "\n".join(lines)
 
 
 def _values(place: Path) -> dict[str, str]:
@@ -114,7 +140,9 @@ def _values(place: Path) -> dict[str, str]:
 
 def _content(file: Path) -> str | None:
     if file.name == "metrics.jsonl":
-        return "\n".join(json.dumps(_lasting(json.loads(line)), sort_keys=True) for line in file.read_text().splitlines())
+        return "\n".join(
+            json.dumps(_lasting(json.loads(line)), sort_keys=True) for line in file.read_text().splitlines()
+        )
     if file.suffix == ".csv":
         rows = list(csv.DictReader(file.open()))
         return json.dumps([_lasting(row) for row in rows], sort_keys=True)
@@ -126,10 +154,11 @@ def _content(file: Path) -> str | None:
 
 
 def _lasting(value: object) -> object:
-    """The value without what differs from run to run; a run is called RUN, and a method an arm, as it once was."""
+    """The value without what differs from run to run, under the names that things have now."""
     if isinstance(value, dict):
-        kept = {"arm" if key == "method" else key: _lasting(item) for key, item in value.items() if key not in FLEETING}
-        return {{"attempts": "rollouts"}.get(key, key): item for key, item in kept.items()}
+        renamed = {"arm": "method", "attempts": "rollouts"}
+        kept = {key: _lasting(item) for key, item in value.items() if key not in FLEETING}
+        return {renamed.get(key, re.sub(*MASKS[0], key)): item for key, item in kept.items()}
     if isinstance(value, list):
         return [_lasting(item) for item in value]
     return re.sub(MASKS[0][0], "TIME", value) if isinstance(value, str) else value

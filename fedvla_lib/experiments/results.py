@@ -34,6 +34,7 @@ def read_results(folder: Path) -> pd.DataFrame:
 
 
 def cell_folders(folder: Path) -> Iterator[Path]:
+    """Yield the run folders of an experiment's cells, or raise ValueError if there is none."""
     cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
     if not cells:
         raise ValueError(f"no results in {folder}: make some with fedvla experiment")
@@ -41,6 +42,7 @@ def cell_folders(folder: Path) -> Iterator[Path]:
 
 
 def cell_columns(cell: Path) -> dict[str, Any]:
+    """Return what a cell's stamp says of it, by the name of the column."""
     stamp = run_folder.read_stamp(cell)
     train_s = float("nan") if stamp["train_s"] is None else stamp["train_s"]
     return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], "train_s": train_s}

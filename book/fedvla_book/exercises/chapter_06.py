@@ -41,7 +41,7 @@ def unpaired(find: Callable[[Sequence, Sequence], Sequence]) -> None:
     )
     expect(not list(find(left, left[::-1])), "The same rollouts in another order can all be paired.")
     more = find(left, [*left, ("stack", 7)])
-    expect([tuple(rollout) for rollout in more] == [("stack", 7)], "An method may also have made more than the other.")
+    expect([tuple(rollout) for rollout in more] == [("stack", 7)], "A method may also have made more than the other.")
 
 
 def two_errors(errors: Callable[[np.ndarray, np.ndarray], tuple[float, float]]) -> None:

@@ -12,7 +12,7 @@ from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
 def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
-    """Draw a table as bars: a group per row, a colour per column; an method keeps its colour."""
+    """Draw a table as bars: a group per row, a colour per column; a method keeps its colour."""
     ax = ax or new_axes()
     width = 0.8 / table.shape[1]
     for i, name in enumerate(table.columns):
@@ -27,7 +27,7 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
 
 
 def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point an method: held-out loss across, success rate up; columns method, loss, success_rate, low, high."""
+    """Draw one point a method: held-out loss across, success rate up; columns method, loss, success_rate, low, high."""
     ax = ax or new_axes()
     for i, point in enumerate(table.itertuples()):
         color = method_color(point.method, i)
@@ -65,7 +65,7 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw differences in success of one method to others, a panel for each other method, a row for each partition.
 
-    Each panel has its own scale: what separates an method from its rival is small beside what separates it from a bad one.
+    Each panel has its own scale: what separates a method from its rival is small beside what separates it from a bad one.
 
     Args:
         table: columns partition, method, other, difference, low, high; the same method in all lines.
@@ -113,7 +113,7 @@ def _column_color(name: str, place: int) -> str:
 
 
 def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw held-out loss and success against gradient steps, an method a colour: mean and range over training seeds.
+    """Draw held-out loss and success against gradient steps, a method a colour: mean and range over training seeds.
 
     Args:
         rounds: columns method, run, steps, loss, success_rate (NaN: not measured).
@@ -138,7 +138,7 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
 
 
 def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point a checkpoint: held-out loss across, success rate up, an method a colour; columns as above."""
+    """Draw one point a checkpoint: held-out loss across, success rate up, a method a colour; columns as above."""
     ax = ax or new_axes()
     for i, (method, part) in enumerate(rounds.groupby("method", sort=False)):
         ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=method_color(method, i), label=method)

@@ -44,7 +44,7 @@ def use_style() -> None:
 
 
 def method_color(method: str, other: int = 0) -> str:
-    """Return the colour of an method throughout the book; one without its own takes number `other` of the palette."""
+    """Return the colour of a method throughout the book; one without its own takes number `other` of the palette."""
     name = method.lower().replace(", ", "-") + "-"
     own = [color for family, color in METHOD_FAMILIES.items() if name.startswith(f"{family}-")]
     return own[-1] if own else PALETTE[other % len(PALETTE)]

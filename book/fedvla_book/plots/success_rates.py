@@ -130,7 +130,7 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw points of success for each megabyte that travelled, a bar an method; columns method, MB, success_rate, low, high.
+    """Draw points of success for each megabyte that travelled, a bar a method; columns method, MB, success_rate, low, high.
 
     The interval is that of the success rate, divided by the bytes, which are known exactly.
     """

@@ -8,7 +8,6 @@ from scipy.stats import spearmanr
 
 from fedvla_book.tables.grids import OF_RUN
 from fedvla_lib.evaluation import statistics
-from fedvla_lib.experiments.results import OF_RUN
 
 
 def correlations(rounds: pd.DataFrame, by: Sequence[str] = OF_RUN) -> pd.DataFrame:

@@ -11,7 +11,7 @@ from statsmodels.stats.proportion import confint_proportions_2indep
 from fedvla_lib import run_folder
 from fedvla_lib.evaluation import statistics
 from fedvla_lib.evaluation.statistics import CONFIDENCE
-from fedvla_lib.experiments.results import ALONE, HELD_OUT, P_VALUES, cell_columns, cell_folders
+from fedvla_lib.experiments.results import HELD_OUT, LOCAL_ONLY, P_VALUES, cell_columns, cell_folders
 
 OF_RUN = ("partition", "method", "run")
 BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
@@ -22,7 +22,7 @@ def repeat_partition_free(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows, and those of methods that see no partition once more for each partition of the same recording.
 
     Base and centralized training come out the same however a recording is dealt out, so they are measured with one of
-    its partitions; to the others they are lent, for the same seeds and rollouts. A partition that has an method itself is
+    its partitions; to the others they are lent, for the same seeds and rollouts. A partition that has a method itself is
     lent none of it, and no partition is lent anything of another recording, such as that of several laboratories.
 
     Args:
@@ -131,7 +131,7 @@ def at_own_task(rows: pd.DataFrame) -> pd.Series:
         return pd.Series(False, rows.index)
     tasks = sorted(rows.task.unique())
     own = rows.client.map(lambda client: tasks[int(client) % len(tasks)], na_action="ignore")
-    return (rows.kind == ALONE) & (rows.task == own)
+    return (rows.kind == LOCAL_ONLY) & (rows.task == own)
 
 
 def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
@@ -142,7 +142,7 @@ def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
     Args:
         rows: of `read_results`, of partition `task`.
     """
-    part = np.where(rows.kind == ALONE, np.where(at_own_task(rows), f", {OWN}", f", {OTHER}"), "")
+    part = np.where(rows.kind == LOCAL_ONLY, np.where(at_own_task(rows), f", {OWN}", f", {OTHER}"), "")
     taken = rows.groupby("method")[["steps_in_all", "steps_in_a_row"]].transform("mean")
     steps = [f", {_in_words(*each)}" for each in taken.itertuples(index=False)]
     order = taken.assign(method=rows.method, part=part)
@@ -160,7 +160,7 @@ def beside_own_tasks(rows: pd.DataFrame, method: str, other: str, *, seed: int) 
     Args:
         rows: of `read_results`, of partition `task`.
         method: whose clients trained alone.
-        other: an method with the same rollouts.
+        other: a method with the same rollouts.
         seed: of the interval's bootstrap.
 
     Returns:
