@@ -22,7 +22,8 @@ def copy(tmp_path_factory):
     """Return a copy of the files that a chapter needs, with one more chapter."""
     root = tmp_path_factory.mktemp("project")
     (root / "notebooks").mkdir()
-    shutil.copytree(ROOT / "fedvla_lib", root / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+    for package in ("fedvla_lib", "book/fedvla_book"):
+        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
     (root / "tests" / "wrong_answers").mkdir(parents=True)
     shutil.copy(ROOT / "_toc.yml", root)
     shutil.copytree(ROOT / "book" / "reference" / "comparison", root / "book" / "reference" / "comparison")
@@ -68,21 +69,15 @@ def test_it_runs_and_its_solutions_pass_their_checks(copy):
     ]
     script = copy / "notebooks" / "answers.py"
     script.write_text("import numpy as np\nfrom fedvla_book.exercises import check\n\n" + "\n".join(answers))
-    environment = {**os.environ, "PYTHONPATH": str(copy), "FEDVLA_PROFILE": "tiny"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(copy), str(copy / "book")]),
+        "FEDVLA_PROFILE": "tiny",
+    }
     subprocess.run([sys.executable, str(script)], env=environment, check=True, cwd=copy / "notebooks")
-    nbmake = [
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--nbmake",
-        str(notebook),
-        "--rootdir",
-        str(copy),
-        "-c",
-        os.devnull,
-    ]
-    assert subprocess.run([sys.executable, "-m", *nbmake], env=environment, cwd=copy).returncode == 0
+    options = ["-q", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(copy)]
+    command = [sys.executable, "-m", "pytest", *options, "--nbmake", str(notebook)]
+    assert subprocess.run(command, env=environment, cwd=copy).returncode == 0
 
 
 @pytest.mark.unit
