@@ -1,4 +1,4 @@
-"""A deployment for real: SuperLink and SuperNodes as processes, TLS and keys, the same model, intruders refused."""
+"""A real deployment: SuperLink and SuperNodes as processes, TLS and keys, the same model, intruders rejected."""
 
 import contextlib
 import os
@@ -34,7 +34,7 @@ from fedvla_lib.files import write_json
 
 ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
-# Every kind of thing that a client keeps in Flower's Context: control variate, moments, remainder, own parts.
+# All state that a client keeps in Flower's Context: control variate, moments, rounding error, personal parts.
 KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
 
 
@@ -47,7 +47,7 @@ def tiny(recording, tmp_path):
 
 
 def forget(message, context, call_next):
-    """Around a handler: a client that keeps nothing from one message to the next."""
+    """A mod for a client that keeps no state between messages."""
     context.state = RecordDict()
     return call_next(message, context)
 
@@ -59,7 +59,7 @@ def apart(left, right):
 def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_from_its_own_data(
     tiny, recording, tmp_path
 ):
-    """With all that a client keeps between rounds: nodes that forgot it would end in another model."""
+    """With all state that a client keeps between rounds: without it the result would be another model."""
     tiny = replace(tiny, **KEEPING)
     other = record.record(["lift"], 3, tmp_path / "other", image_size=IMAGE_SIZE, seed=5, progress=False)
     own, said = [recording, other], []
@@ -83,7 +83,7 @@ def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_
 
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory):
-    """A deployment of two clients that the tests below meet."""
+    """A deployment of two clients, shared by the tests below."""
     with deployment.running_deployment(tmp_path_factory.mktemp("deployment"), 2, tls=True, auth=True) as here:
         yield here
 
@@ -97,7 +97,7 @@ def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
 
 
 def refusal(node_of: deployment.Deployment) -> str:
-    """Start a SuperNode of the deployment, which has to refuse the server at once, and return its log."""
+    """Start a SuperNode of the deployment, which must reject the server at once, and return its log."""
     with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
         node_of.start_node(0)
     processes.stop(node_of.nodes[0])
@@ -118,7 +118,7 @@ def test_nodes_and_users_that_trust_another_authority_do_not_talk_to_the_server(
 
 
 def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tmp_path, monkeypatch):
-    """By this library as well: here it is asked only whether somebody listens, so that the others can refuse."""
+    """By this library too; its own check is limited to an open port here, so that the other programs can reject it."""
     expired = credentials.make_server(tmp_path / "server", until=datetime.now(UTC) - timedelta(hours=1))
     checked = superlink.answers
     monkeypatch.setattr(superlink, "answers", lambda port, files: not processes.is_free(port))
@@ -136,7 +136,7 @@ def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deploymen
 
 
 def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
-    """Ended without warning after round 1, and started again with its key when a round has gone on without it."""
+    """Killed after round 1 and restarted with its key once a round has run without it."""
     config = replace(tiny, num_server_rounds=5, local_steps=2)
     happened = []
 
@@ -162,7 +162,7 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
 
 
 def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(standing, tiny, monkeypatch, capsys):
-    """On the processes that stand already: what stops new ones is tested with the interrupt."""
+    """On the running processes; stopping new ones is tested with the interrupt."""
     monkeypatch.setattr(deployment, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
     flags = [f"--{name}={value}" for name, value in given(replace(tiny, min_replies=3)).items()]
     assert main(["deploy", "--profile", "tiny", "--tls", "--auth", *flags]) == 2
@@ -202,13 +202,13 @@ def test_a_run_is_told_from_another_one_that_began_later_in_the_same_place(tiny)
 
 
 def given(config):
-    """Settings that differ from those of the profile."""
+    """Flags for the settings that differ from the profile."""
     usual = to_run_config(from_profile("tiny"))
     return {name: value for name, value in to_run_config(config).items() if value != usual[name]}
 
 
 def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_ended(tiny, tmp_path):
-    """The signal goes to the whole group, as a terminal sends it, while round 2 is going on."""
+    """The signal goes to the whole process group, as from a terminal, during round 2."""
     config = replace(tiny, num_server_rounds=50)
     flags = [f"--{name}={value}" for name, value in given(config).items()]
     command = [sys.executable, "-m", "fedvla_lib.cli", "deploy", "--profile", "tiny", "--tls", "--auth", *flags]
@@ -234,7 +234,7 @@ def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_end
 
 
 def left_over(port: str) -> list[str]:
-    """Processes that still name a SuperLink: Flower's helpers look every few seconds whether their parent lives."""
+    """Processes that still name a SuperLink; Flower's helpers check every few seconds whether their parent lives."""
     deadline = time.monotonic() + 15
     while True:
         found = subprocess.run(["pgrep", "-f", f"127.0.0.1:{port}"], capture_output=True, text=True).stdout.split()
@@ -264,7 +264,7 @@ def test_authentication_needs_encryption_and_data_a_folder_for_each_client(tmp_p
 
 
 def written_commands(program: str) -> list[list[str]]:
-    """Every call of a program in the page on deployment and in the containers, as words."""
+    """All calls of a program in the deployment page and the compose file, split into words."""
     page = "\n".join(re.findall(r"^```bash\n(.*?)^```", (ROOT / "book/deployment.md").read_text(), re.M | re.S))
     services = yaml.safe_load((ROOT / "flower/compose.yaml").read_text())["services"].values()
     lines = [*page.replace("\\\n", " ").splitlines(), *(service["command"] for service in services)]
@@ -291,7 +291,7 @@ def test_the_recipe_calls_commands_that_this_library_has():
 
 @pytest.mark.unit
 def test_a_servers_certificate_also_names_it_as_its_own_helper_calls_it(tmp_path, monkeypatch):
-    """A SuperLink on all addresses starts a helper that calls 127.0.0.1, and without that name no run would start."""
+    """A SuperLink on all addresses starts a helper that connects to 127.0.0.1; without that name no run would start."""
     monkeypatch.chdir(tmp_path)
     (recipe,) = [words for words in written_commands("fedvla") if words[1] == "credentials"]
     assert main(recipe[1:]) == 0
@@ -303,14 +303,14 @@ def test_a_servers_certificate_also_names_it_as_its_own_helper_calls_it(tmp_path
 
 @pytest.mark.unit
 def test_the_recipe_registers_a_node_before_it_starts():
-    """A node whose key is not known yet is refused, and ends."""
+    """A node whose key is not registered yet is rejected, and exits."""
     page = (ROOT / "book/deployment.md").read_text()
     assert page.index("flwr supernode register") < page.index("flower-supernode --root-certificates")
 
 
 @pytest.mark.unit
 def test_the_containers_mount_what_the_recipe_makes(tmp_path, monkeypatch, capsys):
-    """Files that are put into containers come from `fedvla credentials`, as the head of the compose file gives it."""
+    """The files mounted into containers come from the `fedvla credentials` call at the top of the compose file."""
     composed = (ROOT / "flower/compose.yaml").read_text()
     monkeypatch.chdir(tmp_path)
     assert main(shlex.split(re.search(r"fedvla (credentials .*)", composed)[1])) == 0

@@ -1,4 +1,4 @@
-"""Adapters: at first they change nothing, they alone train, and saving adds them in."""
+"""Adapters: no effect at first, the only trainable parameters, merged when saved."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ RANK = 4
 
 @pytest.fixture(scope="module")
 def setup(recording):
-    """Settings, held-out batch and training batches on the recording that all tests share."""
+    """Settings, held-out batch and training batches on the shared recording."""
     config = from_profile("tiny", data=str(recording), lora_rank=RANK, num_threads=1)
     store = recordings.open_frames(config)
     train_ids, val_ids = splits.split(store, config.val_fraction, config.seed)

@@ -1,4 +1,4 @@
-"""The policy: same classes for every base, exact round trip to disk, honest failures, reproducible driving."""
+"""The policy: same classes for every base, exact round trip to disk, clear errors, reproducible actions."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Training on stored prefixes is training: same loss, gradients and weights; and only where that is legitimate."""
+"""Training on stored prefixes: same loss, gradients and weights; used only where prefixes are constant."""
 
 from dataclasses import replace
 
