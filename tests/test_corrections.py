@@ -84,9 +84,9 @@ def federate(rounds, examples=(1, 1), share=1.0, replaced_after=0, **settings):
     arrays, path = messages.pack_arrays({"w": np.zeros(1, np.float32)}), []
     for number in range(1, rounds + 1):
         if number - 1 == replaced_after > 0:
-            kept, done = nested(flat(strategy.memory())), replaced_after
+            kept, done = nested(flat(strategy.state())), replaced_after
             strategy = serving(grid, examples, share, done, **settings)
-            strategy.remember(kept)
+            strategy.load_state(kept)
         replies = grid.send_and_receive(strategy.configure_train(number - done, arrays, ConfigRecord(), grid))
         arrays, _ = strategy.aggregate_train(number - done, replies)
         path.append(float(messages.unpack_arrays(arrays)["w"][0]))
@@ -153,7 +153,7 @@ def test_control_variates_sum_to_zero_over_clients():
                 weight = parameter(np.zeros(4))
                 weight.grad = torch.from_numpy(rng.normal(size=4).astype(np.float32))
                 control({"w": weight})
-            own[k] = control.own_after()
+            own[k] = control.updated()
             changes.append(control.change()["w"])
         server = {"w": server["w"] + np.mean(changes, axis=0)}
         assert np.abs(sum(c["w"] - server["w"] for c in own)).max() < 1e-6
@@ -174,7 +174,7 @@ def test_a_parameter_without_gradient_has_a_control_variate_of_zero():
     zeros = {"used": np.zeros(1, np.float32), "idle": np.zeros(1, np.float32)}
     control = ControlVariates(zeros, {})
     control({"used": used, "idle": idle})
-    assert control.own_after() == {"used": np.float32([2.0]), "idle": np.float32([0.0])}
+    assert control.updated() == {"used": np.float32([2.0]), "idle": np.float32([0.0])}
     assert idle.grad is None
 
 

@@ -294,7 +294,7 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
 def test_too_few_good_replies_stop_the_run_and_leave_what_there_is(tiny, tmp_path):
     config = replace(tiny, min_replies=2, out=str(tmp_path), **NO_ROLLOUTS)
     app = damaging({0: crash, 2: DAMAGE["hash"]}, inline.cached(LOADERS))
-    with pytest.raises(TooFewReplies, match="round 1: 1 of 3 training replies are good, min-replies=2 are required"):
+    with pytest.raises(TooFewReplies, match="round 1: 1 of 3 training replies are valid, min-replies=2 are required"):
         inline.run_inline(config, clients_app=app, progress=False)
     (root,) = tmp_path.iterdir()
     assert run_folder.read_stamp(root)["status"].startswith("failed: TooFewReplies")

@@ -26,7 +26,7 @@ from fedvla_lib.federation.messages import (
     unpack_arrays,
     unpack_rollouts,
 )
-from fedvla_lib.federation.nodes import Roster, TooFewReplies, call, wait_for_nodes
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies import build
 from fedvla_lib.federation.strategies.fedavg import CheckedFedAvg
 from fedvla_lib.policy.parameters import ParameterError, digest, shapes_of
@@ -362,7 +362,7 @@ def test_a_client_that_never_answers_is_reported():
 
 def test_too_few_good_replies_stop_the_run_in_clear_words():
     app = answering(lambda k, _: reply_content(_nan(GOOD)) if k else reply_content(GOOD))
-    with pytest.raises(TooFewReplies, match="round 4: 1 of 3 training replies are good, min-replies=2"):
+    with pytest.raises(TooFewReplies, match="round 4: 1 of 3 training replies are valid, min-replies=2"):
         one_round(app, 3, min_replies=2, server_round=4)
 
 
@@ -372,13 +372,13 @@ def test_clients_are_drawn_from_the_seed_by_partition_not_by_node():
     shifted = Roster({k + 77: k for k in range(20)})
     draws = []
     for roster in (mirrored, shifted):
-        drawn = [[roster.name(node) for node in roster.draw(0.3, rng([0, r, 0]))] for r in range(8)]
+        drawn = [[roster.name(node) for node in roster.sample(0.3, rng([0, r, 0]))] for r in range(8)]
         draws.append(drawn)
         assert all(len(set(names)) == 6 for names in drawn)
     assert draws[0] == draws[1]
     assert len({tuple(names) for names in draws[0]}) > 1
-    assert mirrored.draw(0.0, rng(0)) == []
-    assert len(mirrored.draw(0.001, rng(0))) == 1
+    assert mirrored.sample(0.0, rng(0)) == []
+    assert len(mirrored.sample(0.001, rng(0))) == 1
 
 
 def test_a_share_of_the_clients_is_asked():
@@ -497,7 +497,7 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     reason, said = INTRODUCTIONS[fault]
     events = Events()
     grid = InlineGrid(introducing([0, 1, 2], **said), 3, {})
-    roster, introductions = call(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
+    roster, introductions = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
     assert [one.partition_id for one in introductions] == [0, 2] and sorted(roster.partition_of.values()) == [0, 2]
     assert events.rejected() == {f"node_{FIRST_NODE_ID + 1}": reason}
     detail = events[0][3]["detail"]
@@ -517,13 +517,13 @@ def test_joints_that_never_move_can_be_pooled(value):
 
     events = Events()
     grid = InlineGrid(introducing(range(60), stats_of), 60, {})
-    assert len(call(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0)[1]) == 60 and not events
+    assert len(introduce_nodes(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0)[1]) == 60 and not events
 
 
 def test_roll_call_orders_by_partition_and_rejects_a_double():
     events = Events()
     grid = InlineGrid(introducing([2, 0, 2, 1]), 4, {})
-    roster, introductions = call(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)
+    roster, introductions = introduce_nodes(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)
     assert [one.partition_id for one in introductions] == [0, 1, 2]
     assert sorted(roster.partition_of.values()) == [0, 1, 2]
     assert list(events.rejected().values()) == ["partition"]

@@ -1,13 +1,13 @@
-"""What a federation needs to go on after the server died: arrays, the strategy's memory and the clients', each round.
+"""Checkpoints of a federated run, one a round: global arrays, the strategy's state and the clients' states.
 
 ::
 
     <run folder>/checkpoints/round_3/
       arrays.safetensors          the global arrays, unrounded
-      strategy.safetensors        momentum, second moments or control variates, as far as the strategy has any
-      clients.safetensors         what clients keep from round to round, where the engine can give it
+      strategy.safetensors        momentum, second moments or control variates, if the strategy has them
+      clients.safetensors         state that clients keep between rounds, if the engine can read it
 
-Each file carries the SHA-256 of its arrays: safetensors itself notices a file that was cut off, but no flipped bit.
+Each file carries the SHA-256 of its arrays: safetensors notices a truncated file, but not a flipped bit.
 """
 
 import logging
@@ -24,7 +24,7 @@ from fedvla_lib.files import new_folder
 from fedvla_lib.policy.parameters import Arrays, ParameterError, check_digest, digest
 
 logger = logging.getLogger(__name__)
-KEPT = 2  # rounds: the last, and one before it should the disk have failed under the last
+KEPT = 2  # rounds: the last, and the one before in case the last is damaged
 HASH = "sha256"  # in the header of a file
 PARTS = ("arrays", "strategy", "clients")
 NAME = re.compile(r"round_(\d+)")
@@ -32,7 +32,7 @@ NAME = re.compile(r"round_(\d+)")
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A run at the end of a round; arrays by name, the strategy's and clients' names with a path before them."""
+    """A run at the end of a round: arrays by name; names of strategy and client arrays have a path in front."""
 
     round: int
     arrays: Arrays
@@ -41,10 +41,10 @@ class Checkpoint:
 
 
 def save(root: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint into the run folder, whole or not at all, and remove those before the last two.
+    """Write a checkpoint to the run folder atomically, and remove all but the last two.
 
     Raises:
-        OSError: it cannot be written; the message names the checkpoint's folder.
+        OSError: it cannot be written; the message names the folder.
     """
     folder = root / "checkpoints" / f"round_{checkpoint.round}"
     with new_folder(folder, replace=True) as draft:
@@ -56,7 +56,7 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(root: Path) -> Checkpoint:
-    """Return the last checkpoint of a run folder that is whole, and warn of a later one that is damaged.
+    """Return the last intact checkpoint of a run folder, and log a warning for each damaged one after it.
 
     Raises:
         ValueError: there is none.
@@ -81,7 +81,7 @@ def _read(file: Path) -> Arrays:
 
 
 def flat(tree: Mapping[str, Arrays]) -> Arrays:
-    """Return one mapping of arrays for several, the outer name before a slash."""
+    """Join mappings of arrays into one; the outer name comes before a slash."""
     return {f"{outer}/{name}": array for outer, arrays in tree.items() for name, array in arrays.items()}
 
 

@@ -1,7 +1,7 @@
-"""What a client holds and what it does in a round, without Flower: `client_app` is a thin shell around this module.
+"""A client without Flower: what it holds and what it does in a round. `client_app` is a thin shell around this module.
 
-Data set, split and partition follow from the run's settings, so all clients agree on them without talking; each then
-touches only the episodes of its own part.
+Data set, split and partition follow from the run's settings, so that all clients agree on them without communication;
+each client uses only its own episodes.
 """
 
 from collections.abc import Callable
@@ -24,14 +24,14 @@ from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.policy.training import Correction
 
-CLIENT_SEEDS = 1_000  # rollout seeds set aside for each client
+CLIENT_SEEDS = 1_000  # rollout seeds reserved for each client
 
 
 @dataclass(frozen=True)
 class Loaders:
-    """How frames are opened and a policy is built. The inline engine passes functions that remember their result.
+    """How frames are opened and a policy is built; the inline engine passes cached functions.
 
-    Lending one policy to several clients is safe: each overwrites all trainable arrays and nothing else ever changes.
+    Clients may share one policy: each overwrites all trainable arrays, and nothing else changes.
     """
 
     open_frames: Callable[[Config], frame_store.FrameStore]
@@ -43,7 +43,7 @@ LOADERS = Loaders(open_frames, model.load_policy)
 
 @dataclass(frozen=True)
 class Client:
-    """Client `partition_id` of a run."""
+    """One client of a run."""
 
     config: Config
     partition_id: int
@@ -52,7 +52,7 @@ class Client:
 
     @property
     def num_examples(self) -> int:
-        """Training frames: the client's weight."""
+        """Training frames: the client's weight in the average."""
         return num_frames(self.store, self.share.train_ids)
 
     def statistics(self) -> Stats:
@@ -66,11 +66,11 @@ class Client:
         correction: Correction | None = None,
         moments: Arrays | None = None,
     ) -> training.TrainResult:
-        """Train for one round; data order and learning rate go on where the round before stopped.
+        """Train for one round, continuing the data order and learning-rate schedule of the round before.
 
         Args:
-            correction: what the strategy adds to gradients.
-            moments: the optimiser's state after this client's last round; None starts each round afresh.
+            correction: changes gradients, as the strategy asks.
+            moments: optimiser state after this client's last round; None starts fresh.
         """
         config = self.config
         return training.local_train(
@@ -86,21 +86,21 @@ class Client:
         )
 
     def batches(self) -> Batches:
-        """Training batches; each client has its own random stream."""
+        """Training batches; the random stream is the client's own."""
         config, seed = self.config, client_seed(self.config.seed, self.partition_id)
         return Batches(
             self.store, self.share.train_ids, config.chunk_size, config.batch_size, seed=seed, augment=config.augment
         )
 
     def validate(self, bundle: model.Bundle) -> tuple[int, dict[str, float]]:
-        """Return the held-out frames measured and the measurements; 0 and none without held-out episodes."""
+        """Return the number of held-out frames and the averages over them; 0 and {} without held-out episodes."""
         found = measure(bundle, self.store, self.config, episode_ids=self.share.val_ids)
         return found.num_examples, found.averages
 
     def roll_out(self, bundle: model.Bundle, videos_dir: Path) -> list[dict[str, Any]]:
-        """Let the policy act on the tasks that the client holds, in turn; videos go to `videos_dir`.
+        """Roll the policy out on the client's tasks, in turn, with videos in `videos_dir`; return a row per rollout.
 
-        Seeds and the first task differ from client to client, else all would film the same scene.
+        Seeds and the first task differ between clients, so that they do not all show the same scene.
         """
         held = tasks_of(self.store, self.share.train_ids)
         own = labs_of(self.store, self.share.train_ids, self.config)
@@ -118,10 +118,10 @@ class Client:
 
 
 def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, own_data: str = "") -> Client:
-    """Return client `partition_id` with its episodes: a part of the run's data set, or all of one that is its own.
+    """Return client `partition_id` with its part of the run's data set, or with all of its own data set.
 
     Args:
-        own_data: the client's own data set, a folder or hub id; without one it takes its part of ``config.data``.
+        own_data: folder or hub id of the client's own data set; empty for its part of ``config.data``.
 
     Raises:
         ValueError: there is no such partition; the message says what to change.
@@ -147,12 +147,12 @@ def open_pooled(config: Config, loaders: Loaders = LOADERS, partition_id: int = 
 
 
 def client_seed(seed: int, partition_id: int) -> int:
-    """Return the seed of a client's own random stream; streams of different clients and runs do not overlap."""
+    """Return the seed of a client's random stream, different for each client and run."""
     return int(np.random.SeedSequence([seed, partition_id]).generate_state(1)[0])
 
 
 def kept_between_rounds(config: Config) -> dict[str, bool]:
-    """Whether clients keep something from round to round, by the setting that makes them."""
+    """Return, by setting, whether it makes clients keep state between rounds."""
     return {
         f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
         f"exchange={config.exchange}": config.exchange != "float32", "personal": bool(config.personal),

@@ -1,6 +1,6 @@
-"""The Flower ClientApp: unpack a message, call `clients`, pack the answer.
+"""The Flower ClientApp: unpack a message, call `federation.client`, pack the reply.
 
-Errors are not caught here: Flower turns them into error replies, which the server rejects by client name and reason.
+Exceptions are not caught here: Flower turns them into error replies, which the server rejects with client and reason.
 """
 
 import sys
@@ -25,18 +25,14 @@ from fedvla_lib.policy.model import Bundle
 from fedvla_lib.policy.parameters import Arrays, digest, load_arrays, shapes_of, trainable_arrays
 from fedvla_lib.policy.training import Correction, Parameters
 
-# What a client keeps in its state from round to round, beside SCAFFOLD's control variate.
-MOMENTS = "moments"  # its optimiser's
-OWN = "own"  # the parts of the model that are personal
-LEFT_OVER = "left-over"  # of its changes, what rounding has kept from the server so far
+# Keys of what a client keeps in its state between rounds, beside SCAFFOLD's control variate.
+MOMENTS = "moments"  # of its optimiser
+OWN = "own"  # personal parts of the model
+LEFT_OVER = "left-over"  # rounding error of its updates so far
 
 
 def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
-    """Return the ClientApp with handlers for query (statistics), train and evaluate.
-
-    Args:
-        mods: Flower's functions around a handler, the outermost first.
-    """
+    """Return the ClientApp with handlers for query (statistics), train and evaluate; `mods` are Flower's, outermost first."""
     app = ClientApp(mods=list(mods))
 
     @app.query()
@@ -65,9 +61,9 @@ def _introduction(client: Client) -> RecordDict:
 
 
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:
-    """Train for one round, keep what the client keeps between rounds, and return the reply's content."""
+    """Train for one round, save the client's state, and return the content of the reply."""
     exchange, keeps_moments = client.config.exchange, client.config.keep_optimizer
-    start = {} if exchange == "float32" else bundle.shared_arrays()  # needed only to send the change
+    start = {} if exchange == "float32" else bundle.shared_arrays()  # only needed to send an update
     correction = correction_for(message, context, bundle.shared())
     moments = _load_state(context, MOMENTS) if keeps_moments else None
     result = client.train(bundle, message.content[messages.CONFIG][messages.ROUND], correction, moments)
@@ -102,10 +98,8 @@ def _evaluated(client: Client, bundle: Bundle, round_number: int) -> RecordDict:
 
 
 def reserved_cards() -> list[str]:
-    """Return the graphics cards that Flower's simulation runtime has reserved for this client: none elsewhere.
-
-    Its workers are Ray's, where Ray is loaded; nobody else is asked to load it.
-    """
+    """Return the GPUs that Flower's simulation runtime has reserved for this client; none on other engines."""
+    # Its workers run in Ray, where Ray is loaded; on other engines it is not loaded for this question.
     ray = sys.modules.get("ray")
     if ray is None or not ray.is_initialized():
         return []
@@ -113,10 +107,9 @@ def reserved_cards() -> list[str]:
 
 
 def on_reserved_card(config: Config, cards: Sequence[str]) -> Config:
-    """Return settings with which a client computes where the runtime wants it to: on a card that is reserved for it.
+    """Return the settings with device cuda if a GPU is reserved for the client and they name no other device.
 
-    A connection says what its clients get, and the settings of a run do not know it. A device that these name, other
-    than the default, stays.
+    GPUs are reserved by Flower's connection, which the settings of a run do not know.
     """
     return replace(config, device="cuda") if cards and config.device == Config.device else config
 
@@ -130,13 +123,13 @@ def _client(context: Context, loaders: Loaders) -> Client:
 
 
 def correction_for(message: Message, context: Context, parameters: Parameters) -> Correction | None:
-    """Return what the strategy asks to add to gradients: SCAFFOLD sends control variates, FedProx a weight.
+    """Return how the strategy corrects gradients: SCAFFOLD sends control variates, FedProx the weight mu.
 
     Args:
-        parameters: what trains, by name, holding the global arrays of the message.
+        parameters: trainable parameters by name, holding the global arrays of the message.
 
     Raises:
-        ParameterError: the control variates that came are not usable.
+        ParameterError: the control variates are invalid.
     """
     if messages.CONTROL in message.content:
         shapes = shapes_of(parameters)
@@ -149,7 +142,7 @@ def correction_for(message: Message, context: Context, parameters: Parameters) -
 
 
 def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) -> Arrays:
-    """What a reply carries: the arrays themselves, or how they changed, in fewer bits."""
+    """Arrays for a reply: the arrays themselves, or the encoded update."""
     if exchange == "float32":
         return arrays
     change = {name: array - start[name] for name, array in arrays.items()}
@@ -159,21 +152,21 @@ def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) ->
 
 
 def attach_control_variates(reply: RecordDict, correction: Correction | None, context: Context) -> None:
-    """Add to a training reply what the strategy needs beside the arrays, and keep what the client needs next time."""
+    """Add SCAFFOLD's control variate to a training reply, and save the new one in the client's state."""
     if isinstance(correction, ControlVariates):
         change = correction.change()
         reply[messages.CONTROL] = messages.pack_arrays(change)
         reply[messages.NOTE][messages.CONTROL_DIGEST] = digest(change)
-        context.state[messages.CONTROL] = messages.pack_arrays(correction.own_after())
+        context.state[messages.CONTROL] = messages.pack_arrays(correction.updated())
 
 
 def _load_state(context: Context, what: str) -> Arrays:
-    """What this client kept in an earlier round; Flower stores it with the client on every engine."""
+    """Arrays that this client saved in an earlier round; {} if there are none."""
     return messages.unpack_arrays(context.state[what]) if what in context.state else {}
 
 
 def _policy(client: Client, message: Message, loaders: Loaders, context: Context) -> Bundle:
-    """Return the policy holding the global arrays of the message, once they have passed every check, and its own."""
+    """Return the policy with the checked global arrays of the message and the client's personal parts."""
     own = client.config.normalisation == "own"
     sent = message.content[messages.CONFIG][messages.STATS]
     stats = client.statistics() if own else normalisation.unpack_stats(sent)

@@ -1,4 +1,4 @@
-"""How far, and how differently, clients move from the same start: norms and angles of their updates."""
+"""Client drift: norms of the clients' updates in a round, and angles between them."""
 
 from collections.abc import Mapping
 
@@ -7,23 +7,23 @@ import numpy as np
 from fedvla_lib.policy.parameters import Arrays, layer_of
 
 WHOLE = "all"
-MOST_COMPARED = 50  # clients of a round that are compared each with each; beyond, only with the mean of all
+MOST_COMPARED = 50  # clients of a round that are compared pairwise; with more, only to the mean
 
 
 def geometry(start: Arrays, ends: Mapping[str, Arrays]) -> dict[str, dict[str, float]]:
-    """Measure each client's update, its arrays after local training minus `start`.
+    """Measure each client's update: its arrays after local training minus `start`.
 
-    Layers are taken one by one and lengths and products added up, so that a round of a thousand clients needs the
-    memory of its largest layer only, and time that grows with the number of clients, not with its square.
+    Layers are processed one by one and products summed, so that memory is that of the largest layer and time linear in
+    the number of clients.
 
     Args:
         start: the global arrays that all clients started from.
-        ends: for each client its arrays afterwards.
+        ends: arrays after training, by client.
 
     Returns:
-        for each client: ``norm.<part>``, the length of its update in all of the model and in each layer;
-        ``cosine.<part>``, the cosine of the angle to the plain mean of all updates; and ``toward.<client>``, the cosine
-        to each other client's update, among at most `MOST_COMPARED`. A cosine with an update of length 0 is 0.
+        For each client: ``norm.<part>``, the L2 norm of its update in the whole model and in each layer;
+        ``cosine.<part>``, its cosine to the unweighted mean update; and ``toward.<client>``, its cosine to each other
+        client's update, for at most `MOST_COMPARED` clients. The cosine to an update of norm 0 is 0.
     """
     names_of: dict[str, list[str]] = {}
     for name in start:
@@ -44,7 +44,7 @@ def geometry(start: Arrays, ends: Mapping[str, Arrays]) -> dict[str, dict[str, f
 
 
 def _products(start: Arrays, ends: Mapping[str, Arrays], names: list[str]) -> dict[str, np.ndarray]:
-    """Squared lengths of the updates in these arrays, and their products with the mean and with each other."""
+    """Squared norms of the updates in these arrays, and their products with the mean and with each other."""
     moved = np.stack([np.concatenate([(end[n] - start[n]).ravel() for n in names]) for end in ends.values()])
     mean = moved.mean(axis=0)
     compared = moved if len(moved) <= MOST_COMPARED else moved[:0]

@@ -1,8 +1,8 @@
-"""What travels between server and clients: the names of Flower's records, and the conversions on either side.
+"""Messages between server and clients: the names of Flower's records, and packing and checking on either side.
 
 Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
 Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
-SCAFFOLD adds ``control`` both ways: control variates, checked as the arrays are.
+SCAFFOLD adds ``control`` both ways: control variates, checked like the arrays.
 """
 
 import io
@@ -30,17 +30,17 @@ NOTE = "note"
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
-STEPS = "steps"  # gradient steps that a client counted while it trained
+STEPS = "steps"  # gradient steps that the client counted while training
 DIGEST = "sha256"  # of the arrays
 CONTROL_DIGEST = "sha256-control"
 PROXIMAL_MU = "proximal-mu"  # Flower's own key
-DATA = "data"  # in a node's config: the data set that is this client's own
+DATA = "data"  # in a node's config: the client's own data set
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"
-ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # no longer than file systems take
+ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # short enough for any file system
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
-# The numbers of a reply, all of them and no others: Flower averages records with equal keys only.
+# Exactly the numbers of a reply: Flower only averages records with equal keys.
 TRAIN_METRICS = (EXAMPLES, STEPS, "loss", "seconds")
 EVALUATE_METRICS = (EXAMPLES, "loss", "action_error", "action_accuracy", *(f"action_error.{j}" for j in JOINT_NAMES))
 
@@ -70,8 +70,8 @@ def checked_arrays(
     """Unpack `record` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
 
     Args:
-        also: other records of arrays that may be there; more than these is an error.
-        exchange: how the arrays were encoded; they come back as float32.
+        also: other records of arrays that are allowed.
+        exchange: how the arrays were encoded; they are returned as float32.
 
     Raises:
         ParameterError: what is wrong, in one line.
@@ -93,24 +93,22 @@ def checked_arrays(
 
 
 def count_bytes(content: RecordDict) -> int:
-    """Return the bytes of a message's records: arrays as Flower counts them, all else as it is serialised.
-
-    (`ConfigRecord.count_bytes` fails on an empty list or text.)
-    """
+    """Return the bytes of a message's records: arrays as Flower counts them, the rest as serialised."""
+    # Not the rest as Flower counts it: `ConfigRecord.count_bytes` fails on an empty list or text.
     rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
     return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """What a client's closed-loop evaluation sends back."""
+    """The result of a client's rollouts."""
 
-    rows: list[dict[str, Any]]  # a row per rollout, as `evaluate.evaluate` makes them; video is a file name
+    rows: list[dict[str, Any]]  # one per rollout, as from `rollouts.evaluate`; video is a file name
     files: dict[str, bytes]  # videos (mp4) and trajectories (npz) by file name
 
 
 def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
-    """Return rows and the files of `folder` as a note: bytes reach the server whatever the engine."""
+    """Return rows and the files of `folder` as a note, so that they reach the server on every engine."""
     files = sorted(folder.iterdir())
     named = [{**row, "video": Path(row["video"]).name} for row in rows]
     return make_note(
@@ -122,8 +120,8 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     """Return the rollouts of an evaluation reply.
 
     Raises:
-        ParameterError: they cannot be read, or a file name is not that of a rollout: a client must not choose where the
-            server writes.
+        ParameterError: they cannot be read, or a file name is not a rollout's: a client must not choose where the server
+            writes.
     """
     answer = content.config_records.get(NOTE, {})
     try:
@@ -143,26 +141,26 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
 
 
 def make_note(**values: Any) -> ConfigRecord:
-    """Return the client's note: keywords with dashes for underscores."""
+    """Return the client's note; underscores in keywords become dashes."""
     return ConfigRecord({key.replace("_", "-"): value for key, value in values.items()})
 
 
 def _decode(name: str, array: Array) -> np.ndarray:
-    """Return one array of a record, once its bytes are known to be a .npy of numbers and as long as they claim."""
+    """Return one array of a record after checking that its bytes are a .npy of numbers of the declared size."""
     try:
         _check_npy(name, array)
         return array.numpy()
     except ParameterError:
         raise
-    # NumPy hands a header to Python's parser, which fails in a dozen ways; each is the client's, none may end the run.
+    # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
     except Exception as error:
         raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
 
 
 def _check_npy(name: str, array: Array) -> None:
-    """Compare the header with what was declared and with the bytes there are, before anything is allocated.
+    """Compare the header with the declaration and the number of bytes before anything is allocated.
 
-    NumPy alone would open an archive, or set memory aside for as many numbers as the header claims.
+    NumPy alone would open an archive, or allocate as many numbers as the header claims.
     """
     file = io.BytesIO(array.data)
     version = np.lib.format.read_magic(file)

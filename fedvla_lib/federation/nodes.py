@@ -1,4 +1,4 @@
-"""Who takes part: Flower's nodes have random ids, ours hold partitions, and one question per run tells which."""
+"""The nodes of a run: Flower gives them random ids, and each says once which partition it holds."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -14,22 +14,22 @@ from fedvla_lib.federation.messages import NOTE
 from fedvla_lib.policy.parameters import ParameterError
 from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
 
-# Called with (round, who, kind, values) for everything worth keeping; a run folder's `log` fits.
+# Called with (round, who, kind, values) for each event; `RunFolder.log` is one.
 Report = Callable[[int, str, str, dict[str, Any]], None]
 
-MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # their lengths
-MOST_FRAMES = 2**40  # three thousand years of frames: keeps the sum of all counts in 64 bits, and is no other defence
+MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # -> length
+MOST_FRAMES = 2**40  # keeps the sum of all counts in 64 bits; it does not protect against a client that lies
 LARGEST = float(np.finfo(np.float32).max)  # policies normalise in float32; its square is still finite in float64
-ROUNDING = 1e-6  # of the largest value: how far a mean may lie outside its range
+ROUNDING = 1e-6  # relative: how far a mean may lie outside its range
 
 
 class TooFewReplies(RuntimeError):
-    """A round has fewer good replies than the run requires."""
+    """A round has fewer valid replies than `min-replies`."""
 
 
 @dataclass(frozen=True)
 class Introduction:
-    """What a client says about itself before training."""
+    """What a client reports before training."""
 
     partition_id: int
     num_examples: int  # training frames
@@ -41,26 +41,26 @@ class Roster:
     """Which node holds which partition."""
 
     partition_of: dict[int, int]  # node id -> partition id
-    examples_of: dict[int, int] = field(default_factory=dict)  # node id -> training frames it introduced itself with
+    examples_of: dict[int, int] = field(default_factory=dict)  # node id -> training frames that it reported
 
     def name(self, node_id: int) -> str:
         """Return the client's name: ``client_3`` holds partition 3."""
         return client_name(self.partition_of[node_id])
 
-    def draw(self, share: float, rng: np.random.Generator) -> list[int]:
-        """Draw a share of the clients without replacement (one at least, none if it is 0): node ids by partition."""
+    def sample(self, share: float, rng: np.random.Generator) -> list[int]:
+        """Sample a share of the clients without replacement: `sample_size` node ids, ordered by partition."""
         nodes = sorted(self.partition_of, key=self.partition_of.get)
-        size = draw_size(share, len(nodes))
+        size = sample_size(share, len(nodes))
         return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
 
 
-def draw_size(share: float, num_clients: int) -> int:
-    """Return how many clients a round draws: a share of them, one at least, none if the share is 0."""
+def sample_size(share: float, num_clients: int) -> int:
+    """Return how many clients a round samples: at least one, or none if the share is 0."""
     return max(1, round(share * num_clients)) if share else 0
 
 
 def client_name(partition_id: int) -> str:
-    """Return the name a client has in metrics, folders and messages."""
+    """Return a client's name in metrics, folders and messages."""
     return f"client_{partition_id}"
 
 
@@ -81,11 +81,12 @@ def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
     return nodes
 
 
-def call(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> tuple[Roster, list[Introduction]]:
-    """Ask every node for its partition, frames and statistics; leave out, and report, whose answer cannot be used.
+def introduce_nodes(
+    grid: Grid, nodes: list[int], report: Report, timeout_s: float
+) -> tuple[Roster, list[Introduction]]:
+    """Ask every node for its partition, frames and statistics; report and leave out nodes whose reply is invalid.
 
-    Returns:
-        the roster, and the introductions in the order of partitions.
+    Returns the roster, and the introductions ordered by partition.
     """
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
     replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
@@ -97,19 +98,13 @@ def call(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> tupl
             values = {"to": "query", "reason": error.kind, "detail": str(error)}
             report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
     by_partition = sorted(known, key=lambda node: known[node].partition_id)
-    members = Roster(
-        {node: known[node].partition_id for node in by_partition},
-        {node: known[node].num_examples for node in by_partition},
-    )
-    return members, [known[node] for node in by_partition]
+    partitions = {node: known[node].partition_id for node in by_partition}
+    examples = {node: known[node].num_examples for node in by_partition}
+    return Roster(partitions, examples), [known[node] for node in by_partition]
 
 
 def answered(reply: Message | None) -> Message:
-    """Return `reply` if the client answered with content.
-
-    Raises:
-        ParameterError: no answer, or an error in its place.
-    """
+    """Return `reply` if it has content; raise ParameterError for no reply or an error reply."""
     if reply is None:
         raise ParameterError("silent", "no reply came in time")
     if reply.has_error():
@@ -133,24 +128,19 @@ def _introduction(reply: Message, others: Iterable[Introduction]) -> Introductio
 
 
 def _statistics(text: Any, num_examples: int) -> Stats:
-    """Return a client's statistics if they can be pooled with those of others.
-
-    Raises:
-        ParameterError: what is wrong, in one line.
-    """
+    """Return a client's statistics if they can be pooled; raise ParameterError saying what is wrong."""
     if not isinstance(text, str):
-        raise ParameterError("statistics", f"statistics are no text but {type(text).__name__}")
+        raise ParameterError("statistics", f"statistics are not text but {type(text).__name__}")
     try:
         stats = unpack_stats(text)
-    # A text that is no JSON or ragged, one of another structure, one nested too deep.
+    # Not JSON, ragged arrays, another structure, or nested too deeply.
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ParameterError("statistics", f"statistics cannot be read: {error!r}") from error
     _check_keys("statistics", stats, (STATE_KEY, ACTION_KEY))
-    for key, of_feature in stats.items():
-        _check_keys(key, of_feature, MEASURES)
-        _check_measures(key, of_feature)
-        if of_feature["count"][0] != num_examples:
-            count = int(of_feature["count"][0])
+    for key, measures in stats.items():
+        _check_keys(key, measures, MEASURES)
+        _check_measures(key, measures)
+        if (count := int(measures["count"][0])) != num_examples:
             raise ParameterError("examples", f"{key} counts {count} frames, but num-examples={num_examples}")
     return stats
 
@@ -161,7 +151,7 @@ def _check_keys(what: str, found: Iterable[str], expected: Iterable[str]) -> Non
 
 
 def _check_measures(key: str, measures: dict[str, np.ndarray]) -> None:
-    """Return if the measures of one feature are numbers that some frames could have."""
+    """Raise ParameterError unless the measures of a feature are numbers that some frames could have."""
     for name, length in MEASURES.items():
         value, kind = measures[name], "i" if name == "count" else "f"
         if value.dtype.kind != kind or value.shape != (length,):

@@ -1,23 +1,26 @@
-"""Fewer bits a number on the way to the server, and what rounding loses carried over to the next round.
+"""Exchange with fewer bits per number, and error feedback: rounding errors are carried over to the next round.
 
-A client sends the change of its arrays, rounded. What the rounding leaves out is added to the client's next change
-before that is rounded in turn, so that over rounds the server receives the sum of all changes up to one rounding error
-(error feedback: Seide et al. 2014; Karimireddy et al. 2019, https://arxiv.org/abs/1901.09847). The way down carries the
-model itself, at 16 bits where fewer than 32 are asked for; the server adds changes to its own unrounded arrays, so
-nothing is lost there either.
+A client sends its update, rounded. The rounding error is added to its next update before that is rounded, so that over
+rounds the server receives the sum of all updates up to one rounding error (error feedback: Seide et al. 2014;
+Karimireddy et al. 2019, https://arxiv.org/abs/1901.09847). The server sends the model itself, with 16 bits if the
+exchange has fewer than 32, and adds updates to its own unrounded arrays.
 """
 
 import numpy as np
 
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes
 
-DOWNWARD = {"float32": "float32", "float16": "float16", "int8": "float16"}  # what a model travels down in
-SCALE = "|scale"  # beside an int8 array: what one step of it is worth
-LEVELS = 127  # int8 without its lowest value, so that both signs reach equally far
+DOWNWARD = {
+    "float32": "float32",
+    "float16": "float16",
+    "int8": "float16",
+}  # exchange -> type in which the server sends the model
+SCALE = "|scale"  # beside an int8 array: the value of one step
+LEVELS = 127  # int8 without -128, so that the range is symmetric
 
 
 def encode(arrays: Arrays, exchange: str) -> Arrays:
-    """Round float32 arrays to what `exchange` sends; int8 adds a float32 ``<name>|scale`` of shape () to each."""
+    """Round float32 arrays to the type of `exchange`; int8 adds a float32 ``<name>|scale`` of shape () for each."""
     if exchange == "float32":
         return arrays
     if exchange == "float16":
@@ -32,7 +35,7 @@ def encode(arrays: Arrays, exchange: str) -> Arrays:
 
 
 def decode(encoded: Arrays, exchange: str) -> Arrays:
-    """Return the float32 arrays that `encode` made into `encoded`, as far as rounding kept them."""
+    """Return float32 arrays from what `encode` returned, up to rounding."""
     if exchange == "int8":
         names = [name for name in encoded if not name.endswith(SCALE)]
         return {name: encoded[name].astype(np.float32) * encoded[name + SCALE] for name in names}
@@ -40,7 +43,7 @@ def decode(encoded: Arrays, exchange: str) -> Arrays:
 
 
 def with_feedback(change: Arrays, left_over: Arrays, exchange: str) -> tuple[Arrays, Arrays]:
-    """Encode a change together with what was left over from earlier ones; return it and what is left over now."""
+    """Encode an update plus the rounding error of earlier ones; return it and the new rounding error."""
     wanted = {name: array + left_over[name] if left_over else array for name, array in change.items()}
     encoded = encode(wanted, exchange)
     arrived = decode(encoded, exchange)
@@ -48,11 +51,7 @@ def with_feedback(change: Arrays, left_over: Arrays, exchange: str) -> tuple[Arr
 
 
 def check_encoded(encoded: Arrays, shapes: Shapes, exchange: str) -> None:
-    """Return if `encoded` can be decoded to finite arrays of these names and shapes.
-
-    Raises:
-        ParameterError: a name, type or shape is not what `encode` makes, or a value is not finite.
-    """
+    """Raise ParameterError unless `encoded` decodes to finite arrays of these names and shapes."""
     wanted = dict(shapes) | ({name + SCALE: () for name in shapes} if exchange == "int8" else {})
     if set(encoded) != set(wanted):
         odd = sorted(set(encoded) ^ set(wanted))[0]

@@ -1,6 +1,6 @@
-"""The Flower ServerApp: pool the clients' statistics, average their training round by round, judge and keep each model.
+"""The Flower ServerApp: pool the clients' statistics, run the rounds, save and evaluate each global model.
 
-The run folder's place is left in ``context.state["run"]["folder"]`` for whoever started the app.
+It leaves the path of the run folder in ``context.state["run"]["folder"]``.
 """
 
 import time
@@ -19,7 +19,7 @@ from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, client, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.messages import Rollouts
-from fedvla_lib.federation.nodes import Roster, TooFewReplies, call, client_name, wait_for_nodes
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies import checked
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.throttled_grid import for_simulation
@@ -28,17 +28,17 @@ from fedvla_lib.policy.parameters import Arrays, load_arrays, shapes_of
 from fedvla_lib.robot.tasks import check_tasks
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 
-CONNECT_TIMEOUT_S = 60.0  # how long to wait for clients to connect
+CONNECT_TIMEOUT_S = 60.0  # for all clients to connect
 
 
 class ClientStates(Protocol):
-    """An engine that can say, and restore, what its clients keep from round to round."""
+    """An engine that can read and restore the states of its clients."""
 
     def client_states(self) -> dict[str, Arrays]:
-        """Return what clients keep, by client and kind, then by name."""
+        """Return the clients' arrays by client and kind, then by name."""
 
     def restore_clients(self, states: dict[str, Arrays]) -> None:
-        """Give clients back what they kept."""
+        """Restore what `client_states` returned."""
 
 
 def build(
@@ -51,9 +51,9 @@ def build(
     """Return the ServerApp.
 
     Args:
-        engine: written into the stamp.
-        progress: show bars for rollouts.
-        states: reaches what clients keep, where the engine can; else only runs whose clients keep nothing can resume.
+        engine: name for the stamp.
+        progress: show progress bars for rollouts.
+        states: gives access to client states; without it, only runs whose clients keep no state can be resumed.
     """
     app = ServerApp()
 
@@ -75,27 +75,27 @@ def federate(
     progress: bool,
     states: ClientStates | None = None,
 ) -> None:
-    """Carry out a federated run on `grid`, or the rest of one, and write it to `run`.
+    """Run or resume a federation on `grid` and write it to `run`.
 
     Raises:
-        TooFewReplies: too few clients connected, or a round had fewer good replies than `config.min_replies`.
-        ValueError: settings or data that cannot be used.
+        TooFewReplies: too few clients connected, or a round had fewer valid replies than `config.min_replies`.
+        ValueError: unusable settings or data.
     """
     check_tasks(task_names(config))
     before = _before(config, run, states)
-    store = loaders.open_frames(config)  # before any client: many of them must not record the same data at once
+    store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster, weights, pooled = _introduce(grid, config, run)
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.judging_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
-    if before:  # in the order of the model, which is not that of the file
+    if before:  # in the model's order, not the file's
         arrays, done = {name: before.arrays[name] for name in arrays}, before.round
     strategy = build_strategy(
         config, weights, roster=roster, shapes=shapes_of(arrays), report=run.log,
         keep_rollouts=partial(_keep_rollouts, run), rounds_done=done,
     )  # fmt: skip
     if before:
-        strategy.remember(checkpoint.nested(before.strategy))
+        strategy.load_state(checkpoint.nested(before.strategy))
     evaluator = GlobalEvaluator(config, store, bundle, run, progress)
     packed = normalisation.pack_stats(stats)
     strategy.start(
@@ -111,35 +111,35 @@ def federate(
 
 @dataclass(frozen=True)
 class RoundEnd:
-    """Judges the model of a round, then keeps all that the next one needs. Flower calls it first for round 0."""
+    """Evaluates the global model of a round and writes a checkpoint. Flower calls it first for round 0."""
 
     evaluator: "GlobalEvaluator"
     strategy: checked.Checked
     run: RunFolder
     states: ClientStates | None
-    done: int  # rounds completed by an earlier process
+    done: int  # rounds that an earlier process completed
 
     def __call__(self, flowers_round: int, record: ArrayRecord) -> MetricRecord | None:
-        """Close a round; what an earlier process closed stays as it is."""
+        """End a round, unless an earlier process already did."""
         if self.done and flowers_round == 0:
             return None
         number = self.done + flowers_round
         measured = self.evaluator(number, record)
-        memory, kept = self.strategy.memory(), self.states.client_states() if self.states else {}
+        memory, kept = self.strategy.state(), self.states.client_states() if self.states else {}
         arrays = messages.unpack_arrays(record)
         checkpoint.save(self.run.root, Checkpoint(number, arrays, checkpoint.flat(memory), checkpoint.flat(kept)))
         return measured
 
 
 def _before(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
-    """Return where the run to be resumed stood after its last complete round, and clear what came of the next."""
+    """Return the checkpoint to resume from, and remove what was written of later rounds."""
     if not config.resume:
         return None
     kept_by_clients = [name for name, kept in client.kept_between_rounds(config).items() if kept]
     if kept_by_clients and not states:
         raise ValueError(
-            f"{kept_by_clients[0]} lets clients keep something from round to round, which ended with the run on this "
-            "engine: resume on engine inline, or start anew"
+            f"{kept_by_clients[0]} makes clients keep state between rounds, which is lost when a run ends on this "
+            "engine: resume on engine inline, or start a new run"
         )
     found = checkpoint.load(run.root)
     run_folder.forget_after(run.root, found.round)
@@ -150,9 +150,9 @@ def _before(config: Config, run: RunFolder, states: ClientStates | None) -> Chec
 
 @dataclass(frozen=True)
 class GlobalEvaluator:
-    """Keeps and measures the global model after each round: held-out loss, action error, closed-loop success.
+    """Saves and measures the global model of a round: held-out loss, action error, closed-loop success.
 
-    Where parts of the model are personal, the global model has them as they were before training.
+    Personal parts of the global model are as they were before training.
     """
 
     config: Config
@@ -162,7 +162,7 @@ class GlobalEvaluator:
     progress: bool
 
     def __call__(self, round_number: int, arrays: ArrayRecord) -> MetricRecord:
-        """Save ``global_model/round_N``, measure it, and log what was found; round 0 is the model before training."""
+        """Save ``global_model/round_N``, measure it and log the result; round 0 is the model before training."""
         if not measure.is_validated(self.config, round_number):
             return MetricRecord({})
         started = time.perf_counter()
@@ -182,12 +182,12 @@ class GlobalEvaluator:
 
 
 def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
-    """Learn who holds which partition and how many frames, and pool the clients' statistics.
+    """Ask clients for partition, frames and statistics; nothing else about their data leaves them.
 
-    Nothing else about the data leaves a client. Returns the roster, each node's share of all frames, the statistics.
+    Returns the roster, each node's share of all frames, and the pooled statistics.
     """
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    roster, introductions = call(grid, nodes, run.log, config.round_timeout_s)
+    roster, introductions = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
     if len(introductions) < config.min_replies:
         raise TooFewReplies(
             f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
@@ -201,7 +201,7 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict
 
 
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:
-    """Write what a client filmed and log its rows."""
+    """Write a client's videos and log its rollouts."""
     folder = run.videos_dir(round_number, who)
     for name, content in rollouts.files.items():
         folder.mkdir(parents=True, exist_ok=True)

@@ -8,4 +8,4 @@ from fedvla_lib.federation.strategies.checked import Checked
 class CheckedFedYogi(Checked, FedYogi):
     """Yogi on the server: as FedAdam, with a second moment that grows more slowly (https://arxiv.org/abs/2003.00295)."""
 
-    _memory = ("m_t", "v_t")
+    _persistent = ("m_t", "v_t")

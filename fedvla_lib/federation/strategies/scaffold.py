@@ -1,4 +1,4 @@
-"""SCAFFOLD: control variates correct each client's gradients; the client's half and the server's."""
+"""SCAFFOLD: control variates correct the clients' gradients; client's half and server's half."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -18,10 +18,10 @@ from fedvla_lib.policy.training import Parameters, with_gradient
 class ControlVariates:
     """SCAFFOLD's correction: each gradient g_k becomes g_k - c_k + c.
 
-    c_k estimates the client's gradient and c that of all clients, so the corrected step goes where all clients together
-    want to go. Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378, Algorithm 1. The paper's option II for the
-    new c_k, c_k - c + (x - y_K) / (K eta), is under plain SGD the mean of the K gradients before correction; that mean
-    is what is used here, because it means the same whatever optimiser turns gradients into steps.
+    c_k estimates the client's gradient and c the mean gradient of all clients. Karimireddy et al. 2020,
+    https://arxiv.org/abs/1910.06378, Algorithm 1. With plain SGD, the paper's option II for the new c_k,
+    c_k - c + (x - y_K) / (K eta), is the mean of the K gradients before correction; that mean is used here, because it
+    does not depend on the optimiser.
 
     Args:
         server: c by name, float32.
@@ -35,38 +35,37 @@ class ControlVariates:
         self._steps = 0
 
     def __call__(self, parameters: Parameters) -> None:
-        """Remember the gradients, then add c - c_k to them."""
+        """Accumulate the gradients, then add c - c_k to them."""
         self._steps += 1
         for name, parameter in with_gradient(parameters, self._shift):
             gradient = parameter.grad
             self._sum[name] = self._sum[name] + gradient if name in self._sum else gradient.clone()
             gradient.add_(self._shift[name].to(gradient.device))
 
-    def own_after(self) -> Arrays:
-        """Return the new c_k: the mean of the gradients seen, as they were before correction."""
+    def updated(self) -> Arrays:
+        """Return the new c_k: the mean of the gradients before correction."""
         zeros = {name: np.zeros_like(array) for name, array in self._own.items()}
         return zeros | {name: (total / self._steps).cpu().numpy() for name, total in self._sum.items()}
 
     def change(self) -> Arrays:
-        """Return new c_k minus old c_k: what the server adds up."""
-        return {name: array - self._own[name] for name, array in self.own_after().items()}
+        """Return the new c_k minus the old one, which the server adds to c."""
+        return {name: array - self._own[name] for name, array in self.updated().items()}
 
 
 class CheckedScaffold(Checked, FedAvg):
     """SCAFFOLD (Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378): FedAvg with control variates.
 
-    The server keeps c = sum_k p_k c_k over all clients and sends it along; `corrections.ControlVariates` is the half
-    of a client. The paper weighs clients alike; here p_k = n_k / sum n, the weight that averaging gives a client,
-    because with other weights the optimum of the averaged loss would not be a fixed point. With equal clients this is
-    the paper's.
+    The server keeps c = sum_k p_k c_k over all clients and sends it with the model; `ControlVariates` is the client's
+    half. The paper weighs clients equally; here p_k = n_k / sum n, as in averaging, because otherwise the optimum of
+    the averaged loss would not be a fixed point.
 
     Args:
-        weights: p_k by node id, over all clients, whether drawn or not.
+        weights: p_k by node id, for all clients, sampled or not.
         **checked: what `Checked` takes.
     """
 
     _also = (messages.CONTROL,)
-    _memory = ("control",)
+    _persistent = ("control",)
 
     def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
         super().__init__(**checked)
@@ -85,13 +84,13 @@ class CheckedScaffold(Checked, FedAvg):
             record[messages.CONTROL] = messages.pack_arrays(self.control)
         return super()._construct_messages(record, node_ids, message_type)
 
-    def _take(self, server_round: int, good: list[Message]) -> None:
-        """Add the clients' changes to c, and leave in each reply what Flower averages."""
-        for reply in good:
+    def _before_aggregation(self, server_round: int, replies: list[Message]) -> None:
+        """Add the clients' changes to c, and remove them from the replies."""
+        for reply in replies:
             change = messages.unpack_arrays(reply.content.pop(messages.CONTROL))
             weight = np.float32(self.weights[reply.metadata.src_node_id])
             self.control = {name: array + weight * change[name] for name, array in self.control.items()}
-        super()._take(server_round, good)
+        super()._before_aggregation(server_round, replies)
 
     def _check_train(self, reply: Message) -> None:
         super()._check_train(reply)
