@@ -1,4 +1,4 @@
-"""What a chapter takes: counted at its end, kept from a build, shown at its top; a dash is what nobody measured."""
+"""Cost of a chapter: measured at its end, stored from a build, shown at its top; a dash is what was not measured."""
 
 import json
 import subprocess
@@ -34,11 +34,11 @@ def test_spent_adds_up_what_the_federations_exchanged_each_once(tmp_path):
 
 HOLDS = """
 import numpy as np
-from fedvla_lib import cost
-before = cost.spent(0, "tiny", 0).memory_mb
+from fedvla_book import chapter_cost
+before = chapter_cost.spent(0, "tiny", 0).memory_mb
 held = np.ones(80_000_000)  # 640 MB
 del held
-print(before, cost.spent(0, "tiny", 0).memory_mb)
+print(before, chapter_cost.spent(0, "tiny", 0).memory_mb)
 """
 
 
@@ -53,7 +53,7 @@ def executed(folder, name, *, built=True, said=True):
     """An executed chapter as a build leaves it."""
     data, metadata = chapter_cost.spent(5, "tiny", 0)._repr_mimebundle_()
     shown = v4.new_output("execute_result", data=data, metadata=metadata)
-    cell = v4.new_code_cell("cost.spent()", outputs=[shown] if said else [])
+    cell = v4.new_code_cell("chapter_cost.spent()", outputs=[shown] if said else [])
     notebook = v4.new_notebook(cells=[cell], metadata={"fedvla": {"seconds": 7.5}} if built else {})
     folder.mkdir(parents=True, exist_ok=True)
     nbformat.write(notebook, folder / f"{name}.ipynb")

@@ -1,4 +1,4 @@
-"""The video player: one self-contained figure that says in words what the film shows."""
+"""The video player: one self-contained figure with a description of what the video shows."""
 
 import io
 from base64 import b64decode
@@ -34,7 +34,7 @@ class Tags(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def film():
+def mp4():
     return encode_video(np.random.default_rng(0).integers(0, 255, (25, 48, 64, 3), np.uint8))
 
 
@@ -44,28 +44,28 @@ def content(uri, kind):
     return b64decode(data)
 
 
-def test_the_figure_holds_film_poster_and_sentence(film, tmp_path):
-    path = tmp_path / "film.mp4"
-    path.write_bytes(film)
+def test_the_figure_holds_video_poster_and_sentence(mp4, tmp_path):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(mp4)
     page = Tags(video_player.video_figure(path, SENTENCE))
     video = page.found["video"]
     assert not page.opened and page.words == video["aria-label"] == SENTENCE
     assert {"muted", "loop", "controls", "playsinline", "preload"} <= set(video)
-    assert content(video["src"], "video/mp4") == film
+    assert content(video["src"], "video/mp4") == mp4
     with av.open(io.BytesIO(content(video["poster"], "image/jpeg"))) as poster:
         assert next(poster.decode(video=0)).to_ndarray(format="rgb24").shape == (48, 64, 3)
 
 
-def test_captions_say_the_sentence_over_the_whole_film(film):
-    track = Tags(video_player.video_figure(film, SENTENCE)).found["track"]
+def test_captions_say_the_sentence_over_the_whole_video(mp4):
+    track = Tags(video_player.video_figure(mp4, SENTENCE)).found["track"]
     assert track["kind"] == "captions"
     head, time, text = content(track["src"], "text/vtt").decode().strip().replace("\n\n", "\n").split("\n")
     assert (head, time) == ("WEBVTT", "00:00.000 --> 00:02.500")
     assert text == "The arm lifts &quot;the &lt;red&gt; cube&quot; &amp; stops."
 
 
-def test_too_large_a_film_and_one_without_frames_are_refused(film):
-    for wrong, words in ((film.ljust(video_player.MAX_BYTES, b"0"), "less than 1 MB"), (b"no film", "no frames")):
+def test_too_large_a_video_and_one_without_frames_are_refused(mp4):
+    for wrong, words in ((mp4.ljust(video_player.MAX_BYTES, b"0"), "less than 1 MB"), (b"no video", "no frames")):
         with pytest.raises(ValueError, match=words) as refused:
             video_player.video_figure(wrong, SENTENCE)
         assert "\n" not in str(refused.value)

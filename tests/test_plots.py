@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.unit
 @pytest.fixture(autouse=True)
 def close_figures():
     yield
-    plots.plt.close("all")
+    plt.close("all")
 
 
 def labelled(ax):
@@ -38,7 +39,7 @@ def test_joints_draws_state_and_action_of_every_joint_in_seconds():
         assert "[" in ax.get_ylabel()
 
 
-def test_film_strip_shows_first_and_last_frame():
+def test_frame_strip_shows_first_and_last_frame():
     frames = np.random.default_rng(0).integers(0, 255, (30, 8, 10, 3), np.uint8)
     ax = plots.frame_strip(frames, count=4)
     strip = ax.images[0].get_array()
@@ -192,19 +193,19 @@ def test_flow_draws_a_line_per_time_and_the_goal():
     assert labelled(ax)
 
 
-def test_the_film_of_a_flow_shows_each_time_and_holds_the_last():
+def test_the_video_of_a_flow_shows_each_time_and_holds_the_last():
     points = np.arange(12.0).reshape(3, 4)
-    film = plots.flow_video(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4), hold=2)
-    assert film.dtype == np.uint8 and len(film) == 6 + spec.FPS and not any(side % 2 for side in film.shape[1:3])
-    assert (film[0] == film[1]).all() and (film[4] == film[-1]).all()
-    assert (film[1] != film[2]).any() and (film[3] != film[4]).any()
+    frames = plots.flow_video(points, [1, 0.5, 0], ylabel="angle [deg]", goal=np.zeros(4), hold=2)
+    assert frames.dtype == np.uint8 and len(frames) == 6 + spec.FPS and not any(side % 2 for side in frames.shape[1:3])
+    assert (frames[0] == frames[1]).all() and (frames[4] == frames[-1]).all()
+    assert (frames[1] != frames[2]).any() and (frames[3] != frames[4]).any()
 
 
 def test_the_architecture_shows_every_count_and_shape_it_is_given():
-    counts = {part: 1_000 * (i + 1) for i, part in enumerate(plots.PARTS)}
+    counts = {part: 1_000 * (i + 1) for i, part in enumerate(plots.training.PARTS)}
     table = pd.DataFrame({"part": counts.keys(), "parameters": counts.values(), "trainable": 0})
     table.loc[table.part == "action expert", "trainable"] = 7
-    shapes = {name: (8, i, 99) for i, name in enumerate(plots.ARROWS)}
+    shapes = {name: (8, i, 99) for i, name in enumerate(plots.training.ARROWS)}
     ax = plots.architecture(table, shapes)
     words = "|".join(text.get_text() for text in ax.texts)
     assert all(f"\n{count:,}" in words for count in counts.values()) and "(7 trained)" in words
@@ -426,8 +427,9 @@ def is_neutral(colour):
 
 
 def sources():
-    """The module of figures, and the code of every chapter."""
-    yield pytest.param(Path(plots.__file__).read_text(), id="plots")
+    """The modules of figures, and the code of every chapter."""
+    for path in sorted(Path(plots.__file__).parent.glob("*.py")):
+        yield pytest.param(path.read_text(), id=f"plots.{path.stem}")
     for path in sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb")):
         cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
         yield pytest.param("\n".join(cells), id=path.stem)
@@ -435,7 +437,7 @@ def sources():
 
 @pytest.mark.parametrize("code", list(sources()))
 def test_no_figure_has_a_colour_of_its_own(code):
-    known = {*plots.PALETTE, *plots.CLIENT_COLORS, *plots.METHOD_FAMILIES.values()}
+    known = {*plots.PALETTE, *plots.CLIENT_COLORS, *plots.style.METHOD_FAMILIES.values()}
     assert not [colour for colour in colours_in(ast.parse(code)) if colour not in known and not is_neutral(colour)]
 
 

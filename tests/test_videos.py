@@ -1,4 +1,4 @@
-"""`fedvla videos` on a real run's films: what it prints is what was measured, and a damaged file is named."""
+"""`fedvla videos` on a real run's videos: what it prints is what was measured, and a damaged file is named."""
 
 import shutil
 from dataclasses import replace
@@ -25,7 +25,7 @@ def run(recording, tmp_path_factory):
     return inline.run_inline(replace(tiny, out=str(tmp_path_factory.mktemp("run"))), progress=False)
 
 
-def test_what_the_films_say_is_what_the_run_measured(run, tmp_path, capsys):
+def test_what_the_videos_say_is_what_the_run_measured(run, tmp_path, capsys):
     assert main(["videos", str(run / "evaluate"), "--who", "global", "--out", str(tmp_path)]) == 0
     rounds = pd.read_csv(tmp_path / "rounds.csv").set_index(["metric", "round"]).value
     logged = run_folder.read_metrics(run, "rollout").query("who == 'global'")
@@ -40,16 +40,16 @@ def test_what_the_films_say_is_what_the_run_measured(run, tmp_path, capsys):
 def test_damaged_files_are_listed_and_the_rest_is_counted(run, tmp_path, capsys):
     folder = tmp_path / "evaluate"
     shutil.copytree(run / "evaluate", folder)
-    films = sorted(folder.rglob("*.mp4"))
-    films[0].write_bytes(films[0].read_bytes()[:200])
-    films[1].with_suffix(".npz").unlink()
-    films[2].write_bytes(video.encode_video(video.read_video(films[2])[:-3]))  # plays, but ends too early
-    films[3].with_suffix(".npz").write_bytes(b"PK")
+    paths = sorted(folder.rglob("*.mp4"))
+    paths[0].write_bytes(paths[0].read_bytes()[:200])
+    paths[1].with_suffix(".npz").unlink()
+    paths[2].write_bytes(video.encode_video(video.read_video(paths[2])[:-3]))  # plays, but ends too early
+    paths[3].with_suffix(".npz").write_bytes(b"PK")
     assert main(["videos", str(folder)]) == 1
     said = capsys.readouterr()
-    assert f"{len(films) - 4} rollouts whose videos are whole, 4 damaged files" in said.out
+    assert f"{len(paths) - 4} rollouts with intact videos, 4 damaged files" in said.out
     lines = said.err.strip().splitlines()
-    assert len(lines) == 4 and all(any(film.name in line for line in lines) for film in films[:4])
+    assert len(lines) == 4 and all(any(path.name in line for line in lines) for path in paths[:4])
     assert "frames, its trajectory" in said.err
 
 
@@ -57,7 +57,7 @@ def test_bad_input_is_one_line(run, tmp_path, capsys):
     for arguments, words in (
         ([str(tmp_path)], "holds no round_N/WHO/rollout_*.mp4"),
         ([str(run / "evaluate"), "--metrics", "grace"], "unknown metric 'grace': choose from success_rate"),
-        ([str(run / "evaluate"), "--who", "nobody"], "--who nobody filmed nothing there: choose from client_0"),
+        ([str(run / "evaluate"), "--who", "nobody"], "--who nobody has no video there: choose from client_0"),
     ):
         assert main(["videos", *arguments]) == 2
         said = capsys.readouterr().err

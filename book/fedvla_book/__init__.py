@@ -1,4 +1,4 @@
-"""What only the book needs: figures, exercise checks, the video player, the cost of a chapter, checklists.
+"""Code of the book only: figures, tables, exercise checks, video player, chapter costs, checklists.
 
-May import the library, which does not know it. Start reading with `plots`.
+May import the library; the library does not import it. Start reading with `plots`.
 """

@@ -1,8 +1,8 @@
-"""What a chapter costs, measured: of this run at its end, and of the book's own builds in the box at its top.
+"""Cost of a chapter: of this run, shown at its end, and of stored builds of the book, shown at its top.
 
-``python book/tools/keep_costs.py --profile laptop`` takes the measurements out of the chapters that a build executed. Time is
-that of the whole chapter; memory the most that its process held at once, without the processes that Flower starts;
-exchanged is what server and clients of its federations sent each other, in both directions.
+``python book/tools/keep_costs.py --profile laptop`` stores the costs of an executed build. Time is that of the whole
+chapter; memory is the peak of its process without Flower's processes; exchanged is what server and clients of its
+federations sent, in both directions.
 """
 
 import json
@@ -19,13 +19,13 @@ import pandas as pd
 from fedvla_lib import run_folder
 from fedvla_lib.config import PROFILES
 
-KEPT = Path("../book/reference/costs")  # as seen from a chapter; a file for each profile
-MEASURED = "fedvla_cost"  # in the metadata of an output, beside its sentence
+KEPT = Path("../book/reference/costs")  # relative to notebooks/; a file per profile
+MEASURED = "fedvla_cost"  # key in the metadata of the output
 
 
 @dataclass(frozen=True)
 class Spent:
-    """The cost of one run of a chapter; a notebook shows it as a sentence."""
+    """Cost of one run of a chapter, shown as a sentence."""
 
     profile: str
     seed: int
@@ -45,7 +45,7 @@ class Spent:
 
 
 def spent(seconds: float, profile: str | None, seed: int, folders: Iterable[str | Path] = ()) -> Spent:
-    """Return what this process has cost so far; `folders` hold the run folders of its federations, at any depth."""
+    """Return the cost of this process so far; `folders` contain the run folders of its federations, at any depth."""
     logs = {path.resolve() for folder in folders for path in Path(folder).rglob("metrics.jsonl")}
     exchanged = sum(_exchanged(path.parent) for path in logs)
     used = profile or os.environ.get("FEDVLA_PROFILE", "laptop")
@@ -59,26 +59,23 @@ def _exchanged(run: Path) -> int:
 
 def _peak_memory_mb() -> float:
     status = Path("/proc/self/status")
-    if status.exists():  # Linux, whose getrusage also counts what the process held that started this one
+    if status.exists():  # Linux, whose getrusage includes the parent process before exec
         return int(re.search(r"VmHWM:\s*(\d+) kB", status.read_text())[1]) * 1024 / 1e6
-    import resource  # not on Windows, where the rest of this module is still of use
+    import resource  # not available on Windows
 
     unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kibibytes on Linux
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def measured(chapter: str, folder: Path = KEPT) -> pd.DataFrame:
-    """Return what builds of the book measured of a chapter such as ``01_data``: a row for each profile.
-
-    A dash stands for what no build has measured.
-    """
-    rows = {profile: _kept(folder / f"{profile}.json", chapter) for profile in PROFILES}
-    return pd.DataFrame(rows).T.rename_axis(columns="this chapter takes")  # a named index would be a row of its own
+    """Return the stored costs of a chapter such as ``01_data``, a row per profile; a dash is what was not measured."""
+    rows = {profile: _stored(folder / f"{profile}.json", chapter) for profile in PROFILES}
+    return pd.DataFrame(rows).T.rename_axis(columns="this chapter takes")  # a named index would add a header row
 
 
-def _kept(file: Path, chapter: str) -> dict[str, str]:
-    kept = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    found = kept.get("chapters", {}).get(chapter, {})
-    shown = {"time [s]": "seconds", "memory [MB]": "memory_mb", "exchanged [MB]": "exchanged_mb"}
-    cells = {head: f"{found[key]:,.0f}" if found.get(key) is not None else "–" for head, key in shown.items()}
-    return cells | {"on": f"{kept['cores']} cores, {kept['date']}" if found else "–"}
+def _stored(file: Path, chapter: str) -> dict[str, str]:
+    stored = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    costs = stored.get("chapters", {}).get(chapter, {})
+    columns = {"time [s]": "seconds", "memory [MB]": "memory_mb", "exchanged [MB]": "exchanged_mb"}
+    cells = {head: f"{costs[key]:,.0f}" if costs.get(key) is not None else "–" for head, key in columns.items()}
+    return cells | {"on": f"{stored['cores']} cores, {stored['date']}" if costs else "–"}

@@ -1,6 +1,6 @@
-"""Tables -> Axes: every function draws the content of one figure, labels its axes with units and returns the Axes.
+"""Figures of the book: each function draws a table or array, labels its axes with units and returns the Axes.
 
-One file a subject; chapters use all of them through this package.
+One module per subject; chapters import all functions from this package.
 """
 
 from fedvla_book.plots.clients import (

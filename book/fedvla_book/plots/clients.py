@@ -1,4 +1,4 @@
-"""Figures of clients: what they hold, how they differ and how they move."""
+"""Figures of clients: their data, weights, updates and drift."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ def client_counts(counts: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     for i, task in enumerate(counts.columns):
         ax.bar(counts.index.astype(str), counts[task], bottom=bottom, label=task, color=PALETTE[i % len(PALETTE)])
         bottom += counts[task].to_numpy()
-    ax.set_ylim(0, max(1.08 * bottom.max(), ax.get_ylim()[1]))  # the other panels of a shared scale count too
+    ax.set_ylim(0, max(1.08 * bottom.max(), ax.get_ylim()[1]))  # panels may share their scale
     ax.set_xlabel("client")
     ax.set_ylabel("episodes")
     ax.legend(frameon=False, title="task")
@@ -27,7 +27,7 @@ def client_counts(counts: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def client_counts_grid(counts: dict[str, pd.DataFrame], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw `client_counts` of several partitions side by side, on one scale; the keys become titles."""
+    """Draw `client_counts` of several partitions side by side on one scale; keys are titles."""
     if axes is None:
         _, axes = plt.subplots(1, len(counts), figsize=(WIDTH, 3.2), sharey=True, layout="constrained")
     for ax, (name, table) in zip(axes, counts.items(), strict=True):
@@ -42,7 +42,7 @@ def client_counts_grid(counts: dict[str, pd.DataFrame], *, axes: Sequence[Axes] 
 
 
 def heterogeneity(table: pd.DataFrame, *, bounds: dict[str, float] | None = None, ax: Axes | None = None) -> Axes:
-    """Draw columns `total_variation` against `alpha`, one dot a draw, with mean and range; `bounds`: named levels."""
+    """Draw columns `total_variation` against `alpha`, a dot per draw, with mean and range; `bounds`: named levels."""
     ax = ax or new_axes()
     groups = table.groupby("alpha").total_variation
     ax.fill_between(groups.mean().index, groups.min(), groups.max(), alpha=0.15)
@@ -87,7 +87,7 @@ def client_statistics(
 
 
 def client_weights(weights: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw each client's share of the average, in percent: rows are clients, columns are ways to weight."""
+    """Draw each client's weight in the average, in percent: rows are clients, columns are weighting schemes."""
     ax = ax or new_axes()
     width = 0.8 / len(weights.columns)
     for i, name in enumerate(weights.columns):
@@ -101,7 +101,7 @@ def client_weights(weights: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def clients_by_round(table: pd.DataFrame, value: str, *, ylabel: str, ax: Axes | None = None) -> Axes:
-    """Draw a metric of every client by round, and their mean weighted by frames; columns round, who, num_examples."""
+    """Draw a metric of each client by round and the mean weighted by frames; columns round, who, num_examples."""
     ax = ax or new_axes()
     for who, part in table.groupby("who", sort=False):
         color = client_color(int(who.removeprefix("client_")))
@@ -117,9 +117,9 @@ def clients_by_round(table: pd.DataFrame, value: str, *, ylabel: str, ax: Axes |
 
 
 def cosine_map(cosines: np.ndarray, *, title: str = "", ax: Axes | None = None) -> Axes:
-    """Draw cosines between the updates of clients, (clients, clients) in [-1, 1], as coloured squares with numbers."""
+    """Draw cosines between the updates of clients, (clients, clients) in [-1, 1], as a heat map with numbers."""
     ax = ax or new_axes()
-    picture = ax.imshow(cosines, cmap="RdBu", vmin=-1, vmax=1)
+    image = ax.imshow(cosines, cmap="RdBu", vmin=-1, vmax=1)
     for (i, j), cosine in np.ndenumerate(cosines):
         shade = "white" if abs(cosine) > 0.6 else "black"
         ax.text(j, i, f"{cosine:.2f}", ha="center", va="center", fontsize=8, color=shade)
@@ -129,19 +129,19 @@ def cosine_map(cosines: np.ndarray, *, title: str = "", ax: Axes | None = None) 
     ax.set_xlabel("client")
     ax.set_ylabel("client")
     ax.set_title(title, fontsize=10)
-    ax.figure.colorbar(picture, ax=ax, label="cosine", shrink=0.8)
+    ax.figure.colorbar(image, ax=ax, label="cosine", shrink=0.8)
     return ax
 
 
 def federation(
     clients: Sequence[str], *, down: str, up: str, server: str = "server", refused: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Draw a federation: a server above its clients, each in its colour, and what goes down and comes up.
+    """Draw a federation: a server above its clients, each in its colour, with what is sent down and up.
 
     Args:
-        clients: a line of text for each client's box.
-        down, up: what the arrows carry.
-        refused: if given, the text of one more box that the server turns away.
+        clients: text of each client's box.
+        down, up: what is sent in each direction.
+        refused: text of another box, whose connection the server refuses; empty for none.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 3.4), layout="constrained")
@@ -171,29 +171,29 @@ def _box(ax: Axes, x: float, y: float, text: str, color: str) -> None:
     ax.text(x, y, text, ha="center", va="center", fontsize=9)
 
 
-def _arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], **look: str) -> None:
-    ax.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, **look})
+def _arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], **style: str) -> None:
+    ax.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, **style})
 
 
 def client_drift(
     server: np.ndarray, local: Sequence[np.ndarray], wanted: np.ndarray, optimum: np.ndarray, *, ax: Axes | None = None
 ) -> Axes:
-    """Draw federated averaging of two weights: where the clients walk in their local phases, and where averages land.
+    """Draw federated averaging of two weights: the clients' paths in their local phases, and the averages.
 
     Args:
-        server: the average after each round, from the start on, (rounds + 1, 2).
+        server: the start and the average after each round, (rounds + 1, 2).
         local: for each client the points of its local phases, (rounds, steps + 1, 2).
-        wanted: each client's own minimum, (clients, 2).
+        wanted: minimum of each client's loss, (clients, 2).
         optimum: the minimum of the mean loss, (2,).
     """
     ax = ax or new_axes()
     for k, phases in enumerate(local):
         ax.plot(*wanted[k], "X", color=client_color(k), markersize=10)
         for number, phase in enumerate(phases):
-            label = "" if number else f"client {k}; cross: what it wants"
+            label = "" if number else f"client {k}; cross: its minimum"
             ax.plot(*phase.T, "-", color=client_color(k), linewidth=1, label=label)
-    ax.plot(*server.T, "o--", color="black", markersize=4, label="server: average of both")
-    ax.plot(*optimum, "k*", markersize=14, label="best for both together")
+    ax.plot(*server.T, "o--", color="black", markersize=4, label="server: average")
+    ax.plot(*optimum, "k*", markersize=14, label="minimum of the mean loss")
     ax.set_xlabel("first weight")
     ax.set_ylabel("second weight")
     ax.legend(frameon=False, fontsize=8, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))

@@ -12,7 +12,7 @@ from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
 def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
-    """Draw a table as bars: a group per row, a colour per column; a method keeps its colour."""
+    """Draw a table as bars: a group per row, a colour per column; methods keep their colours."""
     ax = ax or new_axes()
     width = 0.8 / table.shape[1]
     for i, name in enumerate(table.columns):
@@ -27,26 +27,26 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
 
 
 def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point a method: held-out loss across, success rate up; columns method, loss, success_rate, low, high."""
+    """Draw success rate against held-out loss, a point per method; columns method, loss, success_rate, low, high."""
     ax = ax or new_axes()
     for i, point in enumerate(table.itertuples()):
         color = method_color(point.method, i)
         error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
         ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.method)
-    ax.set_xscale("log")  # the start may lie many times above the trained methods
+    ax.set_xscale("log")  # the base's loss may be many times that of trained models
     ax.set_xlim(table.loss.min() / 1.4, 1.4 * table.loss.max())
     ax.xaxis.set_major_locator(plt.LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     ax.xaxis.set_major_formatter(lambda loss, _: f"{loss:g}")
     ax.xaxis.set_minor_locator(plt.NullLocator())
     ax.set_ylim(-0.02, 1.02)
-    ax.set_xlabel("held-out loss [normalised units², logarithmic]")
+    ax.set_xlabel("held-out loss [normalised units², log scale]")
     ax.set_ylabel("success rate (95 % Wilson interval)")
     ax.legend(frameon=False)
     return ax
 
 
 def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw differences in success rate with their intervals, a line each; columns method, other, difference, low, high."""
+    """Draw differences in success rate with intervals, a row each; columns method, other, difference, low, high."""
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, max(3.6, 1.2 + 0.4 * len(table))), layout="constrained")
     places = np.arange(len(table))
@@ -65,10 +65,10 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
     """Draw differences in success of one method to others, a panel for each other method, a row for each partition.
 
-    Each panel has its own scale: what separates a method from its rival is small beside what separates it from a bad one.
+    Panels have separate scales, since differences to close and to bad methods are of different size.
 
     Args:
-        table: columns partition, method, other, difference, low, high; the same method in all lines.
+        table: columns partition, method, other, difference, low, high; one `method` in all rows.
     """
     others, partitions = list(dict.fromkeys(table.other)), list(dict.fromkeys(table.partition))
     if axes is None:
@@ -92,14 +92,14 @@ def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None
 def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = None) -> Axes:
     """Draw each column of a table against its index; a column named ``optimum`` is a dotted line.
 
-    Columns of one colour, such as two runs of one method, differ by their dashes.
+    Columns of one colour, such as two runs of a method, have different dashes.
     """
     ax = ax or new_axes()
     colors = [_column_color(str(name), i) for i, name in enumerate(table.columns)]
     for i, name in enumerate(table.columns):
         dashes = DASHES[colors[:i].count(colors[i]) % len(DASHES)]
-        look = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": colors[i], "linestyle": dashes}
-        ax.plot(table.index, table[name], label=name, **look)
+        style = {"color": "black", "linestyle": ":"} if name == "optimum" else {"color": colors[i], "linestyle": dashes}
+        ax.plot(table.index, table[name], label=name, **style)
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
     ax.legend(frameon=False, ncols=min(4, table.shape[1]), loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -107,13 +107,13 @@ def curves(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | None = N
 
 
 def _column_color(name: str, place: int) -> str:
-    """A client keeps its colour; other columns are methods, or take the palette in order."""
+    """Clients and methods keep their colours; other columns take the palette in order."""
     kind, _, number = name.partition(" ")
     return client_color(int(number)) if kind == "client" and number.isdigit() else method_color(name, place)
 
 
 def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw held-out loss and success against gradient steps, a method a colour: mean and range over training seeds.
+    """Draw held-out loss and success against gradient steps, a colour per method: mean and range over training seeds.
 
     Args:
         rounds: columns method, run, steps, loss, success_rate (NaN: not measured).
@@ -138,7 +138,7 @@ def learning_curves(rounds: pd.DataFrame, *, axes: Sequence[Axes] | None = None)
 
 
 def checkpoints(rounds: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw one point a checkpoint: held-out loss across, success rate up, a method a colour; columns as above."""
+    """Draw success rate against held-out loss, a point per checkpoint, a colour per method; see `learning_curves`."""
     ax = ax or new_axes()
     for i, (method, part) in enumerate(rounds.groupby("method", sort=False)):
         ax.plot(part.loss, part.success_rate, "osv^D"[i % 5], alpha=0.7, color=method_color(method, i), label=method)
@@ -153,12 +153,12 @@ def heat_maps(
     tables: dict[str, pd.DataFrame], *, xlabel: str, ylabel: str, label: str, signed: bool = False,
     axes: Sequence[Axes] | None = None,
 ) -> Sequence[Axes]:  # fmt: skip
-    """Draw tables of numbers as coloured squares side by side, on one scale; what is missing is grey, keys are titles.
+    """Draw tables of numbers as heat maps side by side on one scale; missing values are grey, keys are titles.
 
     Args:
-        tables: rows and columns as they are to stand, the same rows in all.
-        label: of the colours.
-        signed: the numbers lie between -1 and 1, and 0 is the middle of the scale; else it begins at 0.
+        tables: all with the same rows.
+        label: of the colour scale.
+        signed: the scale is -1 to 1; otherwise it starts at 0.
     """
     if axes is None:
         _, axes = plt.subplots(1, len(tables), figsize=(WIDTH, 2.6), sharey=True, squeeze=False, layout="constrained")
@@ -166,7 +166,7 @@ def heat_maps(
     top = 1.0 if signed else float(np.nanmax([np.nanmax(table.to_numpy()) for table in tables.values()]))
     for ax, (title, table) in zip(axes, tables.items(), strict=True):
         scale = {"cmap": "RdBu", "vmin": -top} if signed else {"cmap": "viridis", "vmin": 0}
-        picture = ax.imshow(table.to_numpy(float), aspect="auto", vmax=top, **scale)
+        image = ax.imshow(table.to_numpy(float), aspect="auto", vmax=top, **scale)
         ax.set_facecolor("#BBBBBB")
         places = np.unique(np.linspace(0, table.shape[1] - 1, 4).round().astype(int))
         ax.set_xticks(places, table.columns[places])
@@ -175,5 +175,5 @@ def heat_maps(
         ax.set_title(title, fontsize=10)
         ax.set_xlabel(xlabel)
     axes[0].set_ylabel(ylabel)
-    axes[0].figure.colorbar(picture, ax=list(axes), label=label)
+    axes[0].figure.colorbar(image, ax=list(axes), label=label)
     return axes

@@ -13,7 +13,7 @@ from fedvla_lib.robot.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
 
 def joints(states: np.ndarray, actions: np.ndarray, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw measured state and commanded action, both (T, 6), against time: one panel per joint."""
+    """Draw measured state and commanded action, both (T, 6) in degrees and gripper 0-100, against time, per joint."""
     if axes is None:
         axes = joint_axes()
     seconds = np.arange(len(states)) / FPS
@@ -34,7 +34,7 @@ def frame_strip(frames: np.ndarray, *, count: int = 6, title: str = "", ax: Axes
     if ax is None:
         height = WIDTH / len(picks) * frames.shape[1] / frames.shape[2] + 0.6
         _, ax = plt.subplots(figsize=(WIDTH, height), layout="constrained")
-    gap = max(1, frames.shape[2] // 32)  # white, so that one frame does not run into the next
+    gap = max(1, frames.shape[2] // 32)  # white space between frames
     spaced = np.pad(frames[picks], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
     ax.imshow(np.concatenate(list(spaced), axis=1)[:, :-gap])
     centres = np.arange(len(picks)) * spaced.shape[2] + frames.shape[2] / 2
@@ -62,7 +62,7 @@ def padding(masks: np.ndarray, *, ax: Axes | None = None) -> Axes:
 
 
 def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw measured joint positions (T, 6) of several actors against time: one panel per joint."""
+    """Draw measured joint positions (T, 6) of several actors against time, a panel per joint."""
     if axes is None:
         axes = joint_axes()
     for i, ax in enumerate(axes):
@@ -79,7 +79,7 @@ def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None 
 def frame_strips(
     images: dict[str, np.ndarray], *, count: int = 6, axes: Sequence[Axes] | None = None
 ) -> Sequence[Axes]:
-    """Draw each camera's film strip, camera -> (T, H, W, 3), one under the other."""
+    """Draw a `frame_strip` of each camera, camera -> (T, H, W, 3), below each other."""
     if axes is None:
         _, grid = plt.subplots(len(images), 1, figsize=(WIDTH, 1.7 * len(images)), layout="constrained", squeeze=False)
         axes = grid.ravel()
@@ -93,7 +93,7 @@ def frame_strips(
 def image_table(
     rows: dict[str, np.ndarray], *, titles: Sequence[str] = (), axes: np.ndarray | None = None
 ) -> np.ndarray:
-    """Draw a table of pictures: each entry of `rows` is one row of them, (n, H, W, 3); `titles` name the columns."""
+    """Draw a table of images: each entry of `rows` is a row of them, (n, H, W, 3); `titles` name the columns."""
     count = len(next(iter(rows.values())))
     if axes is None:
         side = min(WIDTH / count, 2.2)
@@ -127,7 +127,7 @@ def chunk(
 
 
 def likeness(gaps_s: np.ndarray, distances: np.ndarray, elsewhere: float, *, ax: Axes | None = None) -> Axes:
-    """Draw how far apart two frames of an episode are against the time between them; `elsewhere`: another episode's."""
+    """Draw the difference of two frames of an episode against their time distance; `elsewhere`: to another episode."""
     ax = ax or new_axes()
     ax.plot(gaps_s, distances, "o-", label="same episode")
     ax.axhline(elsewhere, color=PALETTE[1], linestyle="--", label="another episode, same task and moment")

@@ -1,8 +1,8 @@
 """Colours and figure style of the book.
 
-Figures have an opaque white ground so that they stay readable on a dark page; colours are Okabe and Ito's, which remain
-distinct for colour-blind readers. One method and one client keep one colour throughout the book: ask `method_color` and
-`client_color`; other things that are told apart in one figure only take the palette in its order.
+Figures have an opaque white background to stay readable on dark pages; colours are Okabe and Ito's, which colour-blind
+readers can distinguish. Methods and clients keep their colours throughout the book (`method_color`, `client_color`);
+anything else takes the palette in order.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH
 
 METHOD_COLORS = {"base": "#7F7F7F", "local-only": "#E69F00", "federated": "#0072B2", "centralized": "#009E73"}
-METHOD_FAMILIES = {  # what a stored method's name begins with -> its colour; a cadence or an addition follows the name
+METHOD_FAMILIES = {  # first part of a stored method's name -> its colour
     **METHOD_COLORS,
     "fedavg": METHOD_COLORS["federated"],
     "fedavg-10x4x20": "#56B4E9",
@@ -21,7 +21,7 @@ METHOD_FAMILIES = {  # what a stored method's name begins with -> its colour; a 
     "fedprox": "#CC79A7",
 }
 DASHES = ("-", "--", "-.")
-# Okabe and Ito's, then two of Tol's muted scheme: ten clients is what a federation of this book has.
+# Okabe and Ito's colours, then two of Tol's muted scheme: the book's federations have ten clients.
 CLIENT_COLORS = (*PALETTE[:6], "#117733", "#000000", "#882255", "#7F7F7F")
 STYLE = {
     "figure.facecolor": "white",
@@ -44,24 +44,24 @@ def use_style() -> None:
 
 
 def method_color(method: str, other: int = 0) -> str:
-    """Return the colour of a method throughout the book; one without its own takes number `other` of the palette."""
+    """Return the colour of a method throughout the book; a method without one takes number `other` of the palette."""
     name = method.lower().replace(", ", "-") + "-"
     own = [color for family, color in METHOD_FAMILIES.items() if name.startswith(f"{family}-")]
     return own[-1] if own else PALETTE[other % len(PALETTE)]
 
 
 def client_color(client: int) -> str:
-    """Return the colour of a client throughout the book, by its number; ten differ."""
+    """Return the colour of a client throughout the book, by its number; colours repeat after ten."""
     return CLIENT_COLORS[client % len(CLIENT_COLORS)]
 
 
 def legend_above(axes: Sequence[Axes]) -> None:
-    """One legend for panels that share their labels, above all of them."""
+    """Draw one legend above panels that share their labels."""
     handles, labels = axes[0].get_legend_handles_labels()
     axes[0].figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside upper center")
 
 
 def joint_axes() -> Sequence[Axes]:
-    """A panel per joint, two side by side: three would be too small on a page."""
+    """Return a panel per joint in two columns: three would be too small on a page."""
     _, grid = plt.subplots(3, 2, figsize=(WIDTH, 6.2), sharex=True, layout="constrained")
     return grid.ravel()

@@ -10,7 +10,7 @@ from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
 def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success rates with their intervals; columns method, task, success_rate, low, high."""
+    """Draw success rates with intervals by task and method; columns method, task, success_rate, low, high."""
     ax = ax or new_axes()
     methods, tasks = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.task))
     width = 0.8 / len(methods)
@@ -30,7 +30,7 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def rollout_grid(rows: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw who succeeded when: a square per client and round with its task; columns who, round, task, success."""
+    """Draw successes as a grid of clients by rounds; columns who, round, task, success."""
     who, rounds = list(dict.fromkeys(rows.who)), sorted(rows["round"].unique())
     if ax is None:
         _, ax = plt.subplots(figsize=(2.6 + 1.3 * len(rounds), 0.42 * len(who) + 1.2), layout="constrained")
@@ -46,41 +46,41 @@ def rollout_grid(rows: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_yticks(range(len(who)), who)
     ax.grid(False)
     ax.set_xlabel("round")
-    ax.set_ylabel("where the rollouts ran")
+    ax.set_ylabel("client")
     return ax
 
 
 def interval_width(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw the width of an interval against the number of rollouts; columns n, width, success_rate (one line each)."""
+    """Draw interval width against the number of rollouts, a line per success rate; columns n, width, success_rate."""
     ax = ax or new_axes()
     for rate, part in table.groupby("success_rate"):
-        ax.plot(part.n, 100 * part.width, "o-", label=f"{rate:.0%} succeed")
+        ax.plot(part.n, 100 * part.width, "o-", label=f"success rate {rate:.0%}")
     ax.set_xscale("log")
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("number of rollouts (logarithmic)")
+    ax.set_xlabel("number of rollouts (log scale)")
     ax.set_ylabel("width of the 95 % interval [points]")
     ax.legend(frameon=False)
     return ax
 
 
 def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw how often a difference is detected against the rollouts per model; columns n, power, difference."""
+    """Draw the power to detect a difference against rollouts per model; columns n, power, difference."""
     ax = ax or new_axes()
     for difference, part in table.groupby("difference"):
         ax.plot(part.n, part.power, "o-", label=f"true difference {100 * difference:.0f} points")
     ax.axhline(0.8, color="#555555", linestyle=":", linewidth=1)
     ax.set_xscale("log")
     ax.set_ylim(0, 1.02)
-    ax.set_xlabel("rollouts per model (logarithmic)")
-    ax.set_ylabel("share of experiments that see it")
+    ax.set_xlabel("rollouts per model (log scale)")
+    ax.set_ylabel("power: share of experiments that detect it")
     ax.legend(frameon=False)
     return ax
 
 
 def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes | None = None) -> Axes:
-    """Draw a success rate with its interval for each line; columns method, partition, success_rate, low, high.
+    """Draw success rates with intervals, a row per method; columns method, partition, success_rate, low, high.
 
-    A partition has a colour and a place within the method's row, so that methods can be compared in each.
+    Each partition has its colour and its place within the method's row.
     """
     methods, partitions = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.partition))
     if ax is None:
@@ -89,10 +89,10 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
         part = table[table.partition == partition]
         rows = np.array([methods.index(method) for method in part.method]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
         errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
-        if len(partitions) == 1:  # then the colours are the methods'
+        if len(partitions) == 1:  # colours then tell methods apart
             for row, rate, error, method in zip(rows, 100 * part.success_rate, errors.T, part.method, strict=True):
-                look = {"fmt": "o", "capsize": 3, "color": method_color(method, int(row))}
-                ax.errorbar(rate, row, xerr=error[:, None], **look)
+                color = method_color(method, int(row))
+                ax.errorbar(rate, row, xerr=error[:, None], fmt="o", capsize=3, color=color)
             continue
         color = PALETTE[i % len(PALETTE)]
         ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
@@ -108,9 +108,9 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
 
 
 def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw success against what travelled, a labelled point a line; columns method, MB, success_rate, low, high.
+    """Draw success rate against exchanged MB, a point per row; columns method, MB, success_rate, low, high.
 
-    Points of equal MB would hide each other: they stand side by side, around their place.
+    Points of equal MB are shifted apart so that none hides another.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 4.6), layout="constrained")
@@ -123,16 +123,16 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.method)
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
-    ax.set_xlabel("everything that travelled [MB], equals side by side")
+    ax.set_xlabel("exchanged in total [MB, log scale], equal values shifted apart")
     ax.set_ylabel("success rate [%], 95 % interval")
     ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     return ax
 
 
 def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw points of success for each megabyte that travelled, a bar a method; columns method, MB, success_rate, low, high.
+    """Draw success rate per exchanged MB, a bar per method; columns method, MB, success_rate, low, high.
 
-    The interval is that of the success rate, divided by the bytes, which are known exactly.
+    The interval is that of the success rate divided by the bytes, which are known exactly.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 1.0 + 0.3 * len(table)), layout="constrained")
@@ -142,6 +142,6 @@ def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
     ax.barh(places, points["success_rate"], xerr=np.abs(errors), capsize=3, color=PALETTE[0])
     ax.set_yticks(places, table.method)
     ax.set_ylim(len(table) - 0.5, -0.5)
-    ax.set_xlabel("success rate for what travelled [points per MB], 95 % interval")
-    ax.set_ylabel("what travels")
+    ax.set_xlabel("success rate per MB exchanged [points per MB], 95 % interval")
+    ax.set_ylabel("what is exchanged")
     return ax

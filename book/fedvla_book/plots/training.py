@@ -1,4 +1,4 @@
-"""Figures of training: losses, rates, parts of the model, flow matching."""
+"""Figures of training: losses, learning rates, parts of the model, flow matching."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from fedvla_lib.robot.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
 
 def loss_curve(losses: Sequence[float], *, label: str = "training", smooth: int = 20, ax: Axes | None = None) -> Axes:
-    """Draw the loss of each step, with a moving average over `smooth` steps on top."""
+    """Draw the loss of each gradient step and its moving average over `smooth` steps."""
     ax = ax or new_axes()
     values = pd.Series(list(losses))
     steps = np.arange(1, len(values) + 1)
@@ -29,7 +29,7 @@ def loss_curve(losses: Sequence[float], *, label: str = "training", smooth: int 
 
 
 def module_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
-    """Draw parameters per part of a model, trainable and frozen; columns part, parameters, trainable."""
+    """Draw trainable and frozen parameters per part of a model; columns part, parameters, trainable."""
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 0.38 * len(table) + 1.1), layout="constrained")
     millions, trainable = table.parameters / 1e6, table.trainable / 1e6
@@ -46,7 +46,7 @@ def module_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def trainable_bars(tables: dict[str, pd.DataFrame], *, ax: Axes | None = None) -> Axes:
-    """Draw how many parameters train under each setting, split into parts (columns as `module_bars`)."""
+    """Draw the trainable parameters of each setting, split into parts (columns as `module_bars`)."""
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 0.5 * len(tables) + 1.9), layout="constrained")
     counts = pd.DataFrame({name: table.set_index("part").trainable for name, table in tables.items()}) / 1e6
@@ -64,7 +64,7 @@ def trainable_bars(tables: dict[str, pd.DataFrame], *, ax: Axes | None = None) -
 def flow(
     points: np.ndarray, times: Sequence[float], *, ylabel: str, goal: np.ndarray | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw one joint of an action chunk from noise to plan: `points` (times, chunk), a line per flow time."""
+    """Draw one joint of an action chunk from noise to actions: `points` (times, chunk), a line per flow time."""
     ax = ax or new_axes()
     steps = np.arange(1, points.shape[1] + 1)
     shades = plt.get_cmap("viridis")(np.asarray(times) * 0.9)
@@ -123,7 +123,7 @@ def loss_and_success(table: pd.DataFrame, x: str, *, xlabel: str, axes: Sequence
 def flow_video(
     points: np.ndarray, times: Sequence[float], *, ylabel: str, goal: np.ndarray | None = None, hold: int = 3
 ) -> np.ndarray:
-    """Draw `flow` as a film, uint8 (T, H, W, 3): each time stands `hold` frames, the plan at the end a second more."""
+    """Draw `flow` as a video, uint8 (T, H, W, 3): each flow time lasts `hold` frames, the last a second more."""
     stills = [_flow_still(points, times, i, ylabel, goal) for i in range(len(points))]
     return np.stack(stills)[np.repeat(np.arange(len(points)), [hold] * (len(points) - 1) + [hold + FPS])]
 
@@ -131,7 +131,7 @@ def flow_video(
 def _flow_still(
     points: np.ndarray, times: Sequence[float], now: int, ylabel: str, goal: np.ndarray | None
 ) -> np.ndarray:
-    """One time in colour, the times before it in grey, on axes that stay the same for all."""
+    """One flow time in colour and earlier ones in grey, on axes that are the same for all."""
     with plt.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.6), dpi=100, layout="constrained")
         ax = figure.subplots()
@@ -152,7 +152,7 @@ def _flow_still(
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-PARTS = {  # centre and width on a sheet of 10 x 7
+PARTS = {  # centre and width, in units of a 10 x 7 figure
     "vision encoder": (1.5, 5.0, 2.5),
     "connector (pixel shuffle + projection)": (1.5, 3.6, 2.5),
     "state projection": (4.8, 5.0, 2.3),
@@ -163,7 +163,7 @@ PARTS = {  # centre and width on a sheet of 10 x 7
     "action expert": (8.5, 2.0, 2.5),
     "action output projection": (8.5, 0.5, 2.5),
 }
-ARROWS = {  # from, to, where the label stands
+ARROWS = {  # start, end
     "images": ((1.5, 6.3), (1.5, 5.45)),
     "patches": ((1.5, 4.55), (1.5, 4.05)),
     "image tokens": ((1.5, 3.15), (1.5, 2.45)),
@@ -177,15 +177,21 @@ ARROWS = {  # from, to, where the label stands
     "expert tokens": ((8.5, 1.55), (8.5, 0.95)),
     "velocity": ((8.5, 0.05), (8.5, -0.4)),
 }
-OUTSIDE = {"images": 6.7, "state": 6.7, "noisy actions": 6.7, "words": 0.4, "velocity": -0.75}  # what enters or leaves
+OUTSIDE = {
+    "images": 6.7,
+    "state": 6.7,
+    "noisy actions": 6.7,
+    "words": 0.4,
+    "velocity": -0.75,
+}  # y of the labels of inputs and outputs
 
 
 def architecture(table: pd.DataFrame, shapes: dict[str, Sequence[int]], *, ax: Axes | None = None) -> Axes:
-    """Draw SmolVLA's parts with their parameters, and the shape of what flows on each arrow.
+    """Draw SmolVLA's parts with their parameters, and the tensor shape on each arrow.
 
     Args:
-        table: columns part, parameters, trainable, as of `model.module_table`.
-        shapes: by arrow, as named in `ARROWS`; an arrow without a shape stays without one.
+        table: columns part, parameters, trainable, as of `tables.module_table`.
+        shapes: by arrow, as named in `ARROWS`; arrows may lack one.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 6), layout="constrained")
@@ -204,7 +210,7 @@ def architecture(table: pd.DataFrame, shapes: dict[str, Sequence[int]], *, ax: A
 
 
 def _part(ax: Axes, part: str, parameters: int, trainable: int) -> None:
-    """A box with the part's name and its number of parameters; a part that trains in some of them says in how many."""
+    """Draw a box with the part's name and parameters; a partly trained part also has its trained parameters."""
     x, y, width = PARTS[part]
     color = PALETTE[0] if trainable else "#BBBBBB"
     ax.add_patch(plt.Rectangle((x - width / 2, y - 0.45), width, 0.9, facecolor=color, alpha=0.5, edgecolor="black"))

@@ -1,6 +1,6 @@
-"""Tables that the pages of the book show, made from stored results and from what chapters trained.
+"""Tables of the book, from stored results and from what chapters trained.
 
-One file a subject; chapters use all of them through this package.
+One module per subject; chapters import all functions from this package.
 """
 
 from fedvla_book.tables.checkpoints import clear_pairs, correlations, disagreements

@@ -13,12 +13,12 @@ from fedvla_lib.evaluation import statistics
 def correlations(rounds: pd.DataFrame, by: Sequence[str] = OF_RUN) -> pd.DataFrame:
     """Return Spearman's correlation of held-out loss with success over the checkpoints of each group, and over all.
 
-    Columns partition, method, run ("all" where the line does not tell them apart; everywhere in the last line), n
-    (checkpoints), rho: -1 if the loss ranks them as success does, NaN if all are alike or there is one only.
+    Columns partition, method, run ("all" where not grouped by it; the last row is over all), n (checkpoints), rho: -1
+    if loss and success rank checkpoints alike, NaN if all are equal or there is only one.
 
     Args:
-        rounds: of `read_rounds`; what made no rollout is left out.
-        by: columns that make a group, of partition, method and run.
+        rounds: of `results.read_rounds`; rounds without rollouts are ignored.
+        by: grouping columns, from partition, method and run.
     """
     measured = rounds.dropna(subset=["loss", "success_rate"])
     groups = [(dict(zip(by, key, strict=True)), part) for key, part in measured.groupby(list(by), sort=False)]
@@ -35,14 +35,14 @@ def _spearman(part: pd.DataFrame) -> float:
 
 
 def clear_pairs(rounds: pd.DataFrame) -> pd.DataFrame:
-    """Return the pairs of checkpoints that differ in loss and whose intervals of success (Wilson's) are apart.
+    """Return the pairs of checkpoints that differ in loss and whose success intervals (Wilson) do not overlap.
 
-    Columns partition, method, run, round, loss, n, successes, success_rate, low, high of the one with the lower loss, the
-    same with `other_` in front of the other; gap: what lies between the intervals; misled: the lower loss succeeds
-    less often; same_run, and same_episodes: partition and training seed are the same, so the held-out episodes are.
+    Columns partition, method, run, round, loss, n, successes, success_rate, low, high of the checkpoint with the lower
+    loss, and with the prefix `other_` of the other; gap: distance between the intervals; misled: the lower loss has the
+    lower success rate; same_run; same_episodes: same partition and training seed, hence same held-out episodes.
 
     Args:
-        rounds: of `read_rounds`; what made no rollout is left out.
+        rounds: of `results.read_rounds`; rounds without rollouts are ignored.
     """
     table = rounds.dropna(subset=["loss", "success_rate"]).sort_values("loss", kind="stable", ignore_index=True)
     ends = [statistics.wilson(int(k), int(n)) for k, n in zip(table.successes, table.n, strict=True)]
@@ -60,6 +60,6 @@ def clear_pairs(rounds: pd.DataFrame) -> pd.DataFrame:
 
 
 def disagreements(rounds: pd.DataFrame) -> pd.DataFrame:
-    """Return those of `clear_pairs` whose lower loss succeeds less often, the widest gap first."""
+    """Return the `clear_pairs` whose lower loss has the lower success rate, widest gap first."""
     pairs = clear_pairs(rounds)
     return pairs[pairs.misled].sort_values("gap", ascending=False, kind="stable", ignore_index=True)

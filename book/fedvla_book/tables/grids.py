@@ -1,4 +1,4 @@
-"""Tables of stored grids: differences between methods, rounds, labs alone beside the federation."""
+"""Tables of stored grids: differences between methods, rounds, local-only clients next to the federation."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,34 +14,33 @@ from fedvla_lib.evaluation.statistics import CONFIDENCE
 from fedvla_lib.experiments.results import HELD_OUT, LOCAL_ONLY, P_VALUES, cell_columns, cell_folders
 
 OF_RUN = ("partition", "method", "run")
-BLIND = ("base", "centralized")  # kinds that do not see how a recording is dealt out
+PARTITION_FREE = ("base", "centralized")  # kinds that do not depend on the partition of a recording
 OWN, OTHER = "own task", "other tasks"
 
 
 def repeat_partition_free(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, and those of methods that see no partition once more for each partition of the same recording.
+    """Return the rows, and repeat partition-independent methods for each partition of the same recording.
 
-    Base and centralized training come out the same however a recording is dealt out, so they are measured with one of
-    its partitions; to the others they are lent, for the same seeds and rollouts. A partition that has a method itself is
-    lent none of it, and no partition is lent anything of another recording, such as that of several laboratories.
+    Base and centralized training do not depend on the partition, so they are measured with one partition and repeated
+    for the others, with the same seeds and rollouts. A partition that has its own rows of a method keeps only those.
 
     Args:
-        rows: of `read_results`.
+        rows: of `results.read_results`.
     """
-    lent = []
-    for _, there in rows.groupby("recording", sort=False):
-        for _, measured in there[there.kind.isin(BLIND)].groupby("method", sort=False):
-            lender = measured[measured.partition == measured.partition.iloc[0]]
-            lacking = [name for name in there.partition.unique() if name not in set(measured.partition)]
-            lent += [lender.assign(partition=name) for name in lacking]
-    return pd.concat([rows, *lent], ignore_index=True)
+    repeated = []
+    for _, part in rows.groupby("recording", sort=False):
+        for _, measured in part[part.kind.isin(PARTITION_FREE)].groupby("method", sort=False):
+            source = measured[measured.partition == measured.partition.iloc[0]]
+            missing = [name for name in part.partition.unique() if name not in set(measured.partition)]
+            repeated += [source.assign(partition=name) for name in missing]
+    return pd.concat([rows, *repeated], ignore_index=True)
 
 
 def fill_in(rows: pd.DataFrame, other: pd.DataFrame, method: str) -> pd.DataFrame:
-    """Return the partitions of `rows` in which `method` has two training seeds or more, and those that only `other` has.
+    """Return the partitions of `rows` in which `method` has at least two training seeds, and the rest from `other`.
 
     Args:
-        rows, other: of `read_results`, perhaps lent; partitions of one name are the same in both.
+        rows, other: of `results.read_results` or `repeat_partition_free`; equal names are equal partitions.
     """
     seeds = rows[rows.method == method].groupby("partition").run.nunique()
     kept = rows[rows.partition.isin(seeds.index[seeds > 1])]
@@ -119,13 +118,13 @@ def unpaired_difference(
 
 
 def at_own_task(rows: pd.DataFrame) -> pd.Series:
-    """Return for each rollout whether it was at the task of the client that trained alone and made it.
+    """Return for each rollout whether a local-only client made it at its own task.
 
-    Only with partition `task` has a client one task: client k number k of all in alphabetical order, in turn, as
-    `partition.partition` deals them out. Rollouts of other methods, which no client made, are at nobody's own task.
+    With partition `task` client k has task k in alphabetical order, modulo the number of tasks, as assigned by
+    `data.partition.partition`. False for rollouts of other methods.
 
     Args:
-        rows: of `read_results`, of partition `task`, each method with all tasks.
+        rows: of `results.read_results`, of partition `task`, each method with all tasks.
     """
     if "client" not in rows:
         return pd.Series(False, rows.index)
@@ -135,12 +134,12 @@ def at_own_task(rows: pd.DataFrame) -> pd.Series:
 
 
 def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with methods named by the gradient steps of a model of theirs, fewest first.
+    """Return the rows with the gradient steps of one model appended to the method's name, fewest steps first.
 
-    The rollouts of clients that trained alone are split: those at their own task, and those at the others' tasks.
+    Rollouts of local-only clients are split into those at their own task and those at other tasks.
 
     Args:
-        rows: of `read_results`, of partition `task`.
+        rows: of `results.read_results`, of partition `task`.
     """
     part = np.where(rows.kind == LOCAL_ONLY, np.where(at_own_task(rows), f", {OWN}", f", {OTHER}"), "")
     taken = rows.groupby("method")[["steps_in_all", "steps_in_a_row"]].transform("mean")
@@ -155,25 +154,26 @@ def _in_words(in_all: float, in_a_row: float) -> str:
 
 
 def beside_own_tasks(rows: pd.DataFrame, method: str, other: str, *, seed: int) -> dict[str, Any]:
-    """Hold clients that trained alone, at their own tasks, against another method on the same rollouts.
+    """Compare local-only clients, each at its own task, with another method on the same rollouts.
 
     Args:
-        rows: of `read_results`, of partition `task`.
-        method: whose clients trained alone.
+        rows: of `results.read_results`, of partition `task`.
+        method: a local-only method.
         other: a method with the same rollouts.
-        seed: of the interval's bootstrap.
+        seed: of the bootstrap.
 
     Returns:
-        `compare.paired_difference` of method - other where both have one training seed in common, else
-        `compare.difference_over_seeds`; also seeds, and for both methods success_rate and other_rate with low and high.
+        `statistics.paired_difference` of method - other if they share one training seed, else
+        `statistics.difference_over_seeds`; also seeds, and the rates of both: success_rate and other_rate, each with
+        _low and _high.
     """
     own = rows[(rows.method == method) & at_own_task(rows)]
     key = ["run", "task", "seed"]
     same = rows[rows.method == other].merge(own[key], on=key)
     own = own[own.run.isin(same.run)]
     both, seeds = pd.concat([own, same], ignore_index=True), int(own.run.nunique())
-    of = statistics.paired_difference if seeds == 1 else statistics.difference_over_seeds
-    found = {"seeds": seeds, **of(both, method, other, seed=seed)}
+    difference = statistics.paired_difference if seeds == 1 else statistics.difference_over_seeds
+    found = {"seeds": seeds, **difference(both, method, other, seed=seed)}
     for name, part in (("success", own), ("other", same)):
         low, high = statistics.success_interval(part)
         found |= {f"{name}_rate": float(part.success.mean()), f"{name}_low": low, f"{name}_high": high}

@@ -1,4 +1,4 @@
-"""Parts of the model: their parameters, and what averaging adapters loses."""
+"""Tables of the model: parameters of its parts, and the error of averaging LoRA adapters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

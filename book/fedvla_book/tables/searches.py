@@ -1,4 +1,4 @@
-"""Searches for settings, side by side."""
+"""Tables of stored hyperparameter searches."""
 
 import json
 from pathlib import Path
@@ -18,10 +18,10 @@ COMPARED = (
 
 
 def read_searches(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return what each search in a folder of its own below `folder` has found, by strategy.
+    """Return the contents of every ``*/search.json`` in `folder`, by strategy.
 
     Raises:
-        ValueError: there is none, or two are of one strategy.
+        ValueError: there is none, or two have the same strategy.
     """
     files = sorted(Path(folder).glob("*/search.json"))
     found = {one["config"]["strategy"]: one for one in (json.loads(file.read_text(encoding="utf-8")) for file in files)}
@@ -31,11 +31,11 @@ def read_searches(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def compared(searches: dict[str, dict[str, Any]]) -> pd.DataFrame:
-    """Return two lines for each of `searches`: the settings that it started from, and its winner.
+    """Return two rows for each search: the settings that it started from, and its winner.
 
-    Columns: strategy, settings ("start" or "winner"); trials, and how many of them diverged; what was searched for, NaN
-    where a strategy has no such setting; selection_loss, NaN for the start, which is no trial; loss, on the episodes
-    that chose nothing; n, successes, success_rate, low, high (Wilson interval).
+    Columns: strategy, settings ("start" or "winner"); trials and diverged (counts); the searched settings, NaN where a
+    strategy lacks one; selection_loss, NaN for the start; loss, on episodes that selected nothing; n, successes,
+    success_rate, low, high (Wilson interval).
     """
     lines = []
     for name, found in searches.items():
@@ -48,7 +48,7 @@ def compared(searches: dict[str, dict[str, Any]]) -> pd.DataFrame:
 
 
 def _started_from(found: dict[str, Any]) -> dict[str, Any]:
-    """The given value of each setting that was searched for; a server-lr of 0 stands for the strategy's own."""
+    """The initial value of each searched setting; a server_lr of 0 means the strategy's default."""
     given = {name: found["config"][name] for name in found["winner"]}
     if "server_lr" in given:
         given["server_lr"] = given["server_lr"] or SERVER_LR[found["config"]["strategy"]]
