@@ -24,7 +24,7 @@ from fedvla_lib.engines import inline, simulation
 from fedvla_lib.federation import checkpoint, server_app
 from fedvla_lib.federation.checkpoint import Checkpoint
 
-MAIN = "import sys; from fedvla_lib.cli import main; sys.exit(main())"
+MAIN = "import sys; from fedvla_lib.cli.main import main; sys.exit(main())"
 KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
 
 
@@ -86,7 +86,7 @@ def start_and_interrupt(config, round_number):
     process, root = start_until(config, round_number)
     os.killpg(process.pid, signal.SIGINT)
     said = process.communicate(timeout=60)[1]
-    assert process.returncode == 130 and "interrupted: the rounds that ended stay in the run folder" in said
+    assert process.returncode == 130 and "interrupted: completed rounds are in the run folder" in said
     assert run_folder.read_stamp(root)["status"] == "interrupted"
     return root
 
@@ -244,7 +244,7 @@ FULL = """
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from fedvla_lib import checkpoint
+from fedvla_lib.federation import checkpoint
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 kept = {"w": np.zeros(100_000, np.float32)}

@@ -1,5 +1,5 @@
-"""The command line `fedvla` and its doctor.
+"""The command line `fedvla`.
 
-May import everything, but heavy packages only inside a command, so that help answers at once. Start reading with
+May import everything, but heavy packages only inside commands, so that help appears at once. Start reading with
 `parser`.
 """

@@ -1,4 +1,4 @@
-"""``python -m fedvla_lib.cli``: the same as the command `fedvla`."""
+"""``python -m fedvla_lib.cli`` is the command `fedvla`."""
 
 import sys
 

@@ -1,13 +1,12 @@
-"""The commands of `fedvla`: thin shells around the library; each parses, calls and prints.
+"""The commands of `fedvla`, each a function with the command's name that calls the library and prints the result.
 
-Heavy packages are imported inside the commands, so that help and settings answer at once.
+Heavy packages are imported inside the functions, so that help and settings appear at once.
 """
 
 import argparse
 import json
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,20 +15,21 @@ from fedvla_lib.config import Config, from_profile, task_names, to_run_config
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.robot.spec import CAMERAS, image_key
 
-FAILED = 2  # bad input, or a run that failed
-DOWN = 3  # as service managers report a service that is not running
-DAMAGED = 1  # something was found, and not all of it is sound
-LOCAL = "local"  # who acts and is measured where there is no federation
+FAILED = 2  # exit status: bad input, or a run that failed
+DOWN = 3  # exit status of service managers for a service that is not running
+DAMAGED = 1  # exit status: some of the files are damaged
+LOCAL = "local"  # value of `who` in measurements without a federation
+SETTINGS = {field.name for field in fields(Config)} - {"resume"}
 
 
-def settings(options: argparse.Namespace) -> Config:
-    """Return the profile's settings with the given flags on top."""
-    names = {field.name for field in fields(Config)} - {"resume"}
-    return from_profile(options.profile, **{name: value for name, value in vars(options).items() if name in names})
+def settings(options: argparse.Namespace, **overrides: Any) -> Config:
+    """Return the settings of the profile, updated with the given flags and `overrides`."""
+    given = {name: value for name, value in vars(options).items() if name in SETTINGS}
+    return from_profile(options.profile, **given, **overrides)
 
 
 def doctor(options: argparse.Namespace) -> int:
-    """Print the table of checks; 1 if a chapter could not run."""
+    """Print the checks of this machine; status 1 if a chapter could not run."""
     from fedvla_lib.cli.doctor import can_run, examine, table
 
     checks = examine()
@@ -38,30 +38,20 @@ def doctor(options: argparse.Namespace) -> int:
 
 
 def record(options: argparse.Namespace) -> None:
-    """Record into a folder, or into the cache where the chapters look."""
+    """Record demonstrations into a folder, by default into the cache where the chapters look for them."""
     from fedvla_lib.data.record import record as record_episodes
+    from fedvla_lib.data.recordings import resolve
 
-    given = {
-        "episodes_per_task": options.episodes,
-        "image_size": options.image_size,
-        "num_labs": options.num_labs,
-        "seed": options.seed,
-    }
-    chosen = {name: value for name, value in given.items() if value is not None}
-    if options.task:
-        chosen["tasks"] = ",".join(options.task)
-    wanted = from_profile(options.profile, **chosen)
-    if options.out is None:
-        from fedvla_lib.data.recordings import resolve
-
-        print(resolve(wanted))
+    chosen = settings(options, **({"tasks": ",".join(options.task)} if options.task else {}))
+    if options.folder is None:
+        print(resolve(chosen))
         return
-    kinds = {"image_size": wanted.image_size, "seed": wanted.seed, "num_labs": wanted.num_labs}
-    print(record_episodes(task_names(wanted), wanted.episodes_per_task, options.out, **kinds))
+    scenes = {"image_size": chosen.image_size, "seed": chosen.seed, "num_labs": chosen.num_labs}
+    print(record_episodes(task_names(chosen), chosen.episodes_per_task, options.folder, **scenes))
 
 
 def pretrain(options: argparse.Namespace) -> None:
-    """Make a nano base and print how often it succeeds at what it has seen, and at what it has not."""
+    """Pretrain a nano base and print its success rates on pretraining tasks and on unseen ones."""
     import pandas as pd
 
     from fedvla_lib.pretraining.pretrain import pretrain as make
@@ -73,7 +63,7 @@ def pretrain(options: argparse.Namespace) -> None:
 
 
 def experts(options: argparse.Namespace) -> None:
-    """Print each expert's success rate with its interval."""
+    """Print each expert's success rate with its confidence interval."""
     import pandas as pd
     from tqdm.auto import tqdm
 
@@ -95,7 +85,7 @@ def config(options: argparse.Namespace) -> None:
 
 
 def train(options: argparse.Namespace) -> None:
-    """Train one policy, centrally or as one client alone, into a run folder."""
+    """Train one policy, on all data or on one client's, into a run folder."""
     from fedvla_lib.files import write_json
     from fedvla_lib.run_folder import RunFolder, hold, read_config, read_stamp, start
 
@@ -138,72 +128,71 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run a federation and print what was measured of the global model, round by round."""
-    _print_rounds(_engine(options.engine)(_chosen(options)))
+    """Run a federation and print the measurements of the global model by round."""
+    if options.engine == "inline":
+        from fedvla_lib.engines.inline import run_inline as run_federation
+    else:
+        from fedvla_lib.engines.simulation import run_simulation as run_federation
+    _print_rounds(run_federation(_federated_settings(options)))
 
 
-def _chosen(options: argparse.Namespace) -> Config:
-    """Return the settings of a new run, or of the one to go on with."""
-    return _to_resume(options) if options.resume else settings(options)
+def _federated_settings(options: argparse.Namespace) -> Config:
+    """Return the settings of a new run, or of the interrupted run to resume.
 
-
-def _to_resume(options: argparse.Namespace) -> Config:
-    """Return the settings of an interrupted run; with it only what does not change the result may be given.
-
-    Whether it can go on is asked before anything is started for it.
+    Raises:
+        ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
     """
     from fedvla_lib.run_folder import hold, read_config, resumable
 
-    names = {field.name for field in fields(Config)} - {"resume", "num_threads"}
-    if given := sorted(names & set(vars(options))):
+    if not options.resume:
+        return settings(options)
+    if given := sorted((SETTINGS - {"num_threads"}) & set(vars(options))):
         raise ValueError(f"--{given[0].replace('_', '-')} cannot be given with --resume: a run keeps its settings")
     if not (options.resume / "config.json").is_file():
         raise ValueError(f"--resume {options.resume}: no run folder there, it has no config.json")
     threads = {"num_threads": options.num_threads} if "num_threads" in vars(options) else {}
     chosen = replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
-    with hold(options.resume):
+    with hold(options.resume):  # fails here rather than after the engine has started its processes
         resumable(options.resume, chosen)
     return chosen
 
 
 def deploy(options: argparse.Namespace) -> None:
-    """Run a federation on processes of this machine and print what was measured of the global model."""
+    """Run a federation in processes on this machine and print the measurements of the global model by round."""
     from fedvla_lib.engines.deployment import run_deployed
 
-    data = options.node_data or []
-    _print_rounds(run_deployed(_chosen(options), tls=options.tls, auth=options.auth, data=data))
+    chosen, data = _federated_settings(options), options.node_data or []
+    _print_rounds(run_deployed(chosen, tls=options.tls, auth=options.auth, data=data))
 
 
-def standing_superlink(options: argparse.Namespace) -> int:
-    """Start or stop the SuperLink of the connection file, or say whether it is up, or how its last run ended."""
-    from fedvla_lib.engines import superlink_service
+def superlink(options: argparse.Namespace) -> int:
+    """Start or stop the SuperLink service, or print whether it is up or how its newest run ended."""
+    from fedvla_lib.engines import superlink_service as service
 
     if not os.environ.get("FLWR_HOME"):
-        raise ValueError("FLWR_HOME is not set: `. flower/env.sh` first, so that Flower settings of your own stay")
+        raise ValueError("FLWR_HOME is not set: run `. flower/env.sh` first, so that your own Flower settings stay")
     home = Path(os.environ["FLWR_HOME"])
-    if options.action in ("status", "last"):
-        asked, otherwise = {"status": (superlink_service.status, DOWN), "last": (superlink_service.last, FAILED)}[
-            options.action
-        ]
-        is_well, words = asked(home)
-        print(words)
-        return 0 if is_well else otherwise
-    print({"up": superlink_service.up, "down": superlink_service.down}[options.action](home))
-    return 0
+    if options.action in ("up", "down"):
+        print({"up": service.up, "down": service.down}[options.action](home))
+        return 0
+    check, exit_status = (service.status, DOWN) if options.action == "status" else (service.last, FAILED)
+    ok, message = check(home)
+    print(message)
+    return 0 if ok else exit_status
 
 
-def make_credentials(options: argparse.Namespace) -> None:
-    """Write an authority's and a server's certificate and a key for each node, and say who gets which."""
-    from fedvla_lib.engines import credentials
+def credentials(options: argparse.Namespace) -> None:
+    """Write certificates of an authority and a server, and a key for each node; print who gets which file."""
+    from fedvla_lib.engines.credentials import make_node_key, make_server
 
     _require_positive("--nodes", options.nodes)
     if options.out.exists():
         raise ValueError(f"--out {options.out} exists: give a new folder, so that no key is overwritten")
-    files = credentials.make_server(options.out / "server", options.host)
-    keys = [credentials.make_node_key(options.out / "nodes", f"node_{k}") for k in range(options.nodes)]
+    files = make_server(options.out / "server", options.host)
+    keys = [make_node_key(options.out / "nodes", f"node_{k}") for k in range(options.nodes)]
     print(f"for the server only: {files.key}\nfor the server: {files.certificate}\nfor all: {files.authority}")
     for k, key in enumerate(keys):
-        print(f"for node {k} only: {key.private}; its public half, to be registered: {key.public}")
+        print(f"for node {k} only: {key.private}; its public key, to be registered: {key.public}")
 
 
 def _print_rounds(folder: Path) -> None:
@@ -214,18 +203,8 @@ def _print_rounds(folder: Path) -> None:
     print(folder)
 
 
-def _engine(name: str) -> Callable[[Config], Path]:
-    if name == "simulation":
-        from fedvla_lib.engines.simulation import run_simulation
-
-        return run_simulation
-    from fedvla_lib.engines.inline import run_inline
-
-    return run_inline
-
-
 def experiment(options: argparse.Namespace) -> None:
-    """Measure every cell of an experiment that has no result yet."""
+    """Run the unfinished cells of an experiment and print the summary."""
     from fedvla_lib.experiments.experiment import run_plan
     from fedvla_lib.experiments.plan import read_plan
     from fedvla_lib.experiments.results import read_results, summary
@@ -235,7 +214,7 @@ def experiment(options: argparse.Namespace) -> None:
 
 
 def search(options: argparse.Namespace) -> None:
-    """Search, and print the budget, the winner and what it is worth on what did not choose it."""
+    """Search for settings; print the budget, the best settings and their results on data not used for the search."""
     from fedvla_lib.experiments.search import search as search_settings
 
     found = search_settings(settings(options), options.trials, options.rollouts, options.search_out)
@@ -248,7 +227,7 @@ def search(options: argparse.Namespace) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
-    """Roll out a saved policy and print its success rates."""
+    """Roll out a saved policy and print its success rates by task."""
     import pandas as pd
 
     from fedvla_lib.evaluation.rollouts import evaluate as roll_out
@@ -271,7 +250,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Print what runs measured and how they differ; refuse runs that cannot be compared."""
+    """Print the measurements of runs and their differences; runs that are not comparable are an error."""
     from fedvla_lib.evaluation import compare_runs, statistics
 
     metrics = statistics.check_metrics(options.metrics.split(","), compare_runs.METRICS)
@@ -283,10 +262,10 @@ def compare(options: argparse.Namespace) -> None:
     differ = compare_runs.mismatches(runs, metrics)
     if differ and not options.allow_mismatch:
         raise ValueError(f"not comparable: {'; '.join(differ)} (--allow-mismatch compares what they have in common)")
-    chosen = {"seed": options.seed, "confidence": options.confidence}
+    intervals = {"seed": options.seed, "confidence": options.confidence}
     tables = {
-        "values": compare_runs.values(runs, metrics, **chosen),
-        "differences": compare_runs.differences(runs, metrics, **chosen),
+        "values": compare_runs.values(runs, metrics, **intervals),
+        "differences": compare_runs.differences(runs, metrics, **intervals),
     }
     for line in differ:
         print(f"MISMATCH: {line}")
@@ -298,7 +277,7 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def videos(options: argparse.Namespace) -> int:
-    """Print a table for each measurement, and every damaged file; 1 if there is one."""
+    """Print the metrics of rollout videos by round and every damaged file; status 1 if there is one."""
     import pandas as pd
 
     from fedvla_lib.evaluation import statistics, video_report
@@ -306,9 +285,9 @@ def videos(options: argparse.Namespace) -> int:
     metrics = statistics.check_metrics(options.metrics.split(","), video_report.METRICS)
     rows, damaged = video_report.read_videos(options.folder)
     if options.who and len(rows):
-        filmed = sorted(set(rows.who))
-        if options.who not in filmed:
-            raise ValueError(f"--who {options.who} filmed nothing there: choose from {', '.join(filmed)}")
+        names = sorted(set(rows.who))
+        if options.who not in names:
+            raise ValueError(f"--who {options.who} has no video there: choose from {', '.join(names)}")
         rows = rows[rows.who == options.who]
     if len(rows):
         table = pd.concat([video_report.trend_by_round(rows, metric) for metric in metrics], ignore_index=True)
@@ -316,7 +295,7 @@ def videos(options: argparse.Namespace) -> int:
         if options.out:
             video_report.write(options.out, rows, table, damaged)
             print(options.out / "rounds.csv")
-    print(f"{len(rows)} rollouts whose videos are whole, {len(damaged)} damaged files")
+    print(f"{len(rows)} rollouts with intact videos, {len(damaged)} damaged files")
     for line in damaged:
         print(f"fedvla videos: {line}", file=sys.stderr)
     return DAMAGED if damaged else 0
@@ -326,7 +305,7 @@ def _saved_settings(folder: Path) -> Config:
     """Return settings that load the policy saved in `folder` as it was trained.
 
     Raises:
-        ValueError: no pretrained_model folder, or one without our cameras.
+        ValueError: not a pretrained_model folder, or a policy without our cameras.
     """
     if not (folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
@@ -347,5 +326,5 @@ def _print_table(table: Any) -> None:
     from fedvla_lib.evaluation.statistics import p_text
     from fedvla_lib.experiments.results import P_VALUES
 
-    rare = dict.fromkeys(P_VALUES, p_text)
-    print(table.to_string(index=False, float_format=lambda value: f"{value:.3f}", formatters=rare))
+    formats = dict.fromkeys(P_VALUES, p_text)
+    print(table.to_string(index=False, float_format="{:.3f}".format, formatters=formats))

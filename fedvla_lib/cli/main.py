@@ -1,7 +1,7 @@
-"""Run one command of `fedvla`.
+"""The entry point of `fedvla`.
 
-Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130;
-`kill` and a closed terminal count as Ctrl-C.
+Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130.
+`kill` and closing the terminal are handled as Ctrl-C.
 """
 
 import signal
@@ -14,16 +14,18 @@ from contextlib import contextmanager
 from fedvla_lib.cli.commands import FAILED
 from fedvla_lib.cli.parser import build_parser
 
-EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # what the library raises with a message for people
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # the library raises these with a message for users
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # by kill, by the terminal
+SIGNALS = [
+    getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+]  # from kill, from a closing terminal
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     options = build_parser().parse_args(argv)
     try:
-        with _ended_as_by_ctrl_c():
+        with _signals_as_ctrl_c():
             return options.handler(options) or 0
     except KeyboardInterrupt:
         print(f"\ninterrupted: {options.kept}", file=sys.stderr)
@@ -36,16 +38,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _ended_as_by_ctrl_c() -> Iterator[None]:
-    """Meanwhile a command that is told to end stops what it has started. What is ignored stays so, as under nohup."""
+def _signals_as_ctrl_c() -> Iterator[None]:
+    """Let `SIGNALS` raise KeyboardInterrupt, so that commands stop what they started. Ignored ones (nohup) stay so."""
     on_main_thread = threading.current_thread() is threading.main_thread()  # only there may signals be handled
-    signs = [sign for sign in ENDINGS if on_main_thread and signal.getsignal(sign) is signal.SIG_DFL]
-    for sign in signs:
+    handled = [sign for sign in SIGNALS if on_main_thread and signal.getsignal(sign) is signal.SIG_DFL]
+    for sign in handled:
         signal.signal(sign, signal.default_int_handler)
     try:
         yield
     finally:
-        for sign in signs:
+        for sign in handled:
             signal.signal(sign, signal.SIG_DFL)
 
 
