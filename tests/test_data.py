@@ -159,7 +159,7 @@ def test_a_batch_may_be_larger_than_the_data(store):
 
 
 @pytest.mark.integration
-def test_augmentation_changes_pictures_only_and_a_little(store):
+def test_augmentation_changes_images_only_and_a_little(store):
     plain = Batches(store, range(12), CHUNK, batch_size=16, seed=0, augment=False).at(2)
     varied = Batches(store, range(12), CHUNK, batch_size=16, seed=0, augment=True).at(2)
     for key in (STATE_KEY, ACTION_KEY, "action_is_pad"):
@@ -175,7 +175,7 @@ def test_augmentation_changes_pictures_only_and_a_little(store):
 
 
 @pytest.mark.unit
-def test_a_shift_moves_the_picture_and_repeats_the_edge():
+def test_a_shift_moves_the_image_and_repeats_the_edge():
     from fedvla_lib.data.augmentation import _shift
 
     image = np.tile(np.arange(50, dtype=np.uint8)[None, :, None, None], (6, 1, 50, 3))  # brightness = row

@@ -30,20 +30,20 @@ def test_labs_do_not_depend_on_how_many_there_are():
     assert len(set(labs.labs(5, seed=4))) == 5 and labs.labs(2, seed=4)[1] != labs.labs(2, seed=5)[1]
 
 
-def test_a_recording_says_in_which_laboratory_each_episode_was_made(store):
+def test_a_recording_says_in_which_lab_each_episode_was_made(store):
     assert list(store.episodes.lab) == [(i // 2) % 3 for i in range(12)]
     counts = pd.crosstab(store.episodes.lab, store.episodes.task)
     assert (counts == 2).all().all()
 
 
-def test_laboratories_look_different_and_report_other_angles(store):
+def test_labs_look_different_and_report_other_angles(store):
     first = store.images["overhead"][store.episodes.start.to_numpy()].astype(float)
     means = np.array([first[(store.episodes.lab == k).to_numpy()].mean(axis=(0, 1, 2)) for k in range(3)])
     assert np.abs(np.diff(means, axis=0)).max() > 2  # grey levels, between the mean images of two labs
 
 
 @pytest.mark.parametrize("num_clients", [2, 3, 6])
-def test_clients_get_laboratories(store, num_clients):
+def test_clients_get_labs(store, num_clients):
     parts = partition.partition(store.episodes, num_clients, "lab")
     held = [set(store.episodes.set_index("episode_id").lab[part]) for part in parts]
     assert all(len(one) == (1 if num_clients >= 3 else held.index(one) == 0 and 2 or 1) for one in held)
@@ -53,12 +53,12 @@ def test_clients_get_laboratories(store, num_clients):
     assert tables.heterogeneity(parts, store.episodes, by="lab")["total_variation"] > 0.3
 
 
-def test_whoever_trains_on_a_recording_later_means_the_same_laboratories(store):
+def test_runs_with_other_seeds_use_the_labs_of_the_recording(store):
     ids = store.episodes.episode_id
     assert splits.labs_of(store, ids, replace(CONFIG, seed=5)) == splits.labs_of(store, ids, CONFIG)
 
 
-def test_a_client_acts_in_its_own_laboratory(store, tmp_path):
+def test_a_client_acts_in_its_own_lab(store, tmp_path):
     there = labs.labs(3)
     bundle = model.load_policy(
         from_profile("tiny", base="nano-random", num_threads=1), normalisation.episode_stats(store, [0])
@@ -70,7 +70,7 @@ def test_a_client_acts_in_its_own_laboratory(store, tmp_path):
         assert row["lab"] == there[k].name
 
 
-def test_an_evaluation_visits_the_laboratories_in_turn(store):
+def test_an_evaluation_visits_the_labs_in_turn(store):
     bundle = model.load_policy(
         from_profile("tiny", base="nano-random", num_threads=1), normalisation.episode_stats(store, [0])
     )

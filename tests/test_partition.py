@@ -23,7 +23,7 @@ def episode_table(per_task: int, tasks: tuple[str, ...] = TASKS) -> pd.DataFrame
 @pytest.mark.parametrize("scheme", PARTITIONS)
 @pytest.mark.parametrize("num_clients", [1, 2, 3, 4, 10])
 @pytest.mark.parametrize("seed", range(3))
-def test_episodes_are_dealt_out_completely_and_once(scheme, num_clients, seed):
+def test_every_episode_is_assigned_exactly_once(scheme, num_clients, seed):
     table = episode_table(20).iloc[3:]  # ids need not start at 0, tasks need not be balanced
     parts = partition(table, num_clients, scheme, seed=seed, alpha=0.5)
     assert len(parts) == num_clients and all(parts)

@@ -32,7 +32,7 @@ def lerobot_opens(root: Path) -> LeRobotDataset:
 
 
 def made_up_episode(index: int, length: int = 5) -> Episode:
-    """Numbers and pictures that only depend on `index`."""
+    """Return random data that depends on `index` only."""
     rng = np.random.default_rng(index)
     return Episode(
         task="lift",

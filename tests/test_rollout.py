@@ -72,7 +72,7 @@ def test_episode_types_and_words(env):
     assert episode.instruction == f"Lift the {episode.color} cube."
 
 
-def test_same_seed_same_episode_with_or_without_pictures(env):
+def test_same_seed_same_episode_with_or_without_images(env):
     one, again = run_episode(env, Expert(), seed=3), run_episode(env, Expert(), seed=3)
     unseen = run_episode(So100Env("lift", cameras=(), render_mode=None), Expert(), seed=3)
     for other in (again, unseen):

@@ -128,17 +128,17 @@ def test_different_seeds_differ(task):
         assert not np.array_equal(one, other)
 
 
-def test_color_changes_the_words_and_the_picture_but_not_the_layout(task):
+def test_color_changes_the_instruction_and_the_image_but_not_the_layout(task):
     env = So100Env(task, image_size=SIZE)
-    layouts, pictures = [], []
+    layouts, images = [], []
     for color in COLORS:
         observation, _ = env.reset(seed=2, options={"color": color})
         assert env.instruction == env.task_description == task_text(env.layout, task)
         assert env.layout.color == color and len({cube.color for cube in env.layout.cubes}) == len(env.layout.cubes)
         layouts.append(tuple((cube.xy_m, cube.yaw_rad) for cube in env.layout.cubes) + env.layout.zones_xy_m)
-        pictures.append(observation["pixels"]["front"])
+        images.append(observation["pixels"]["front"])
     assert len(set(layouts)) == 1
-    assert not np.array_equal(pictures[0], pictures[1])
+    assert not np.array_equal(images[0], images[1])
 
 
 def test_layouts_stay_in_their_regions_and_use_every_color(task):
@@ -343,7 +343,7 @@ def test_a_cube_that_an_episode_lacks_is_not_seen():
 # --- labs
 
 
-def test_a_laboratory_changes_what_is_seen_and_nothing_that_moves():
+def test_a_lab_changes_the_images_but_not_the_motion():
     lab = draw_lab("elsewhere", np.random.default_rng(0))
     here, there = So100Env("lift", image_size=SIZE), So100Env("lift", image_size=SIZE, lab=lab)
     (one, _), (other, _) = here.reset(seed=1), there.reset(seed=1)
@@ -358,7 +358,7 @@ def test_a_laboratory_changes_what_is_seen_and_nothing_that_moves():
     np.testing.assert_allclose(here.data.qpos, there.data.qpos, atol=1e-6)
 
 
-def test_no_spread_is_the_reference_laboratory():
+def test_no_spread_is_the_reference_lab():
     lab = draw_lab(REFERENCE.name, np.random.default_rng(0), spread=0.0)
     assert lab == REFERENCE
 
@@ -514,7 +514,7 @@ def test_the_end_of_another_environment_in_the_middle_of_drawing_is_put_off(monk
     np.testing.assert_array_equal(env.render(), before)
 
 
-def test_pictures_are_not_blank():
+def test_images_are_not_blank():
     env = So100Env("lift", image_size=SIZE)
     env.reset(seed=0)
     for half in np.hsplit(env.render(), 2):
@@ -542,7 +542,8 @@ def test_drawing_that_cannot_work_says_what_to_set(driver, first):
 
 
 def test_settings_and_specification_do_not_load_the_simulator():
-    code = "import sys, fedvla_lib.config, fedvla_lib.robot.spec, fedvla_lib.robot.tasks; sys.exit('mujoco' in sys.modules)"
+    modules = "fedvla_lib.config, fedvla_lib.robot.spec, fedvla_lib.robot.tasks"
+    code = f"import sys, {modules}; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
 
 

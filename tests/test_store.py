@@ -171,7 +171,7 @@ def test_an_interrupted_video_of_several_episodes_names_the_episode(tmp_path):
 
 
 @pytest.mark.integration
-def test_pictures_inside_the_table_open_too(tmp_path):
+def test_images_inside_the_table_open_too(tmp_path):
     joints = {"dtype": "float32", "shape": (6,), "names": list(JOINT_NAMES)}
     image = {"dtype": "image", "shape": (16, 16, 3), "names": ["height", "width", "channels"]}
     features = {STATE_KEY: joints, ACTION_KEY: dict(joints), image_key("top"): image}
@@ -188,7 +188,7 @@ def test_pictures_inside_the_table_open_too(tmp_path):
 
 
 @pytest.mark.unit
-def test_a_wide_picture_keeps_its_aspect():
+def test_a_wide_image_keeps_its_aspect():
     wide = np.full((10, 40, 3), 200, np.uint8)
     square = fit_square(wide, 20)
     assert square.shape == (20, 20, 3)
