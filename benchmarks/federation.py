@@ -1,6 +1,6 @@
-"""What a federation adds to its clients' own work, in wall time and in memory, in this process.
+"""Overhead of a federation over its clients' own work, in wall time and memory, on the inline engine.
 
-    python benchmarks/federation.py
+python benchmarks/federation.py
 """
 
 import argparse
@@ -22,33 +22,33 @@ from report import laptop, options, peak_memory_mb, recording, report, start, ti
 
 
 def main() -> None:
-    """Measure and report; each number of clients runs in a process of its own, so that peaks do not mix."""
+    """Measure and report; each number of clients runs in its own process, so that memory peaks are separate."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--clients", type=int, default=10, help="clients of the larger run")
-    parser.add_argument("--rounds", type=int, default=2, help="rounds")
-    parser.add_argument("--alone", type=int, help="used by this script: run with so many clients and print the numbers")
+    parser.add_argument("--clients", type=int, default=10, help="number of clients")
+    parser.add_argument("--rounds", type=int, default=2, help="number of rounds")
+    parser.add_argument("--alone", type=int, help="used internally: run with this many clients and print the numbers")
     chosen = parser.parse_args()
     config = replace(laptop(chosen.profile), num_server_rounds=chosen.rounds, eval_rollouts=0, eval_every=0)
     if chosen.alone:
         print(json.dumps(measure(replace(config, num_clients=chosen.alone))))
         return
     recording(config)
-    one, whole = (in_its_own_process(count, chosen) for count in (1, chosen.clients))
+    one, many = (in_own_process(count, chosen) for count in (1, chosen.clients))
     row = {
         "clients": chosen.clients,
-        "wall time [s]": whole["wall"],
-        "clients' training and evaluation [s]": whole["clients"],
-        "ratio of times": whole["wall"] / whole["clients"],
-        "server's own evaluation [s]": whole["judging"],
-        "ratio without it": (whole["wall"] - whole["judging"]) / whole["clients"],
-        "peak memory [MB]": whole["memory"],
+        "wall time [s]": many["wall"],
+        "clients' training and evaluation [s]": many["clients"],
+        "ratio of times": many["wall"] / many["clients"],
+        "server's own evaluation [s]": many["evaluation"],
+        "ratio without it": (many["wall"] - many["evaluation"]) / many["clients"],
+        "peak memory [MB]": many["memory"],
         "peak memory with one client [MB]": one["memory"],
-        "ratio of memories": whole["memory"] / one["memory"],
+        "ratio of memories": many["memory"] / one["memory"],
     }
     report("federation", [row], chosen.out)
 
 
-def in_its_own_process(count: int, chosen: argparse.Namespace) -> dict[str, float]:
+def in_own_process(count: int, chosen: argparse.Namespace) -> dict[str, float]:
     """Measure a federation of `count` clients."""
     command = [sys.executable, __file__, "--alone", str(count), "--rounds", str(chosen.rounds)]
     done = subprocess.run([*command, "--profile", chosen.profile], check=True, capture_output=True, text=True)
@@ -56,25 +56,24 @@ def in_its_own_process(count: int, chosen: argparse.Namespace) -> dict[str, floa
 
 
 def measure(config: Config) -> dict[str, float]:
-    """Run a federation; return its wall time, the time inside its clients, and the most memory held."""
-    inside: list[float] = []
+    """Run a federation; return its wall time, the time inside its clients, and peak memory."""
+    seconds: list[float] = []
     tools = inline.cached(client.LOADERS)
     with tempfile.TemporaryDirectory() as out:
-        app = Watched(client_app.build(tools), inside)
+        app = TimedApp(client_app.build(tools), seconds)
         wall = timed(lambda: inline.run_inline(replace(config, out=out), clients_app=app, progress=False))
         (run,) = Path(out).iterdir()
-        judged = read_metrics(run, "evaluate").query("who == 'global'").seconds.sum()
-    return {"wall": wall, "clients": sum(inside), "judging": float(judged), "memory": peak_memory_mb()}
+        evaluation = read_metrics(run, "evaluate").query("who == 'global'").seconds.sum()
+    return {"wall": wall, "clients": sum(seconds), "evaluation": float(evaluation), "memory": peak_memory_mb()}
 
 
-class Watched:
-    """A ClientApp that notes how long each message took."""
+class TimedApp:
+    """A ClientApp that records the time of each message."""
 
     def __init__(self, app: ClientApp, seconds: list[float]) -> None:
         self._app, self._seconds = app, seconds
 
     def __call__(self, message: Message, context: Context) -> Message:
-        """Handle a message."""
         replies: list[Message] = []
         self._seconds.append(timed(lambda: replies.append(self._app(message, context))))
         return replies[0]

@@ -1,4 +1,4 @@
-"""What the nano base is worth: success at tasks it never saw, after a minute or so of training on one core.
+"""Fine-tuning the nano base: success at tasks it never saw, after about a minute of training on one core.
 
 python benchmarks/fine_tuning.py
 """
@@ -20,10 +20,10 @@ from report import laptop, options, recording, report, start
 def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--tasks", default="lift,place,push", help="tasks, each learned alone, from the base")
-    parser.add_argument("--demonstrations", type=int, default=50, help="episodes of each task")
-    parser.add_argument("--steps", type=int, default=1200, help="optimiser steps")
-    parser.add_argument("--rollouts", type=int, default=100, help="attempts at each task")
+    parser.add_argument("--tasks", default="lift,place,push", help="tasks, each trained separately from the base")
+    parser.add_argument("--demonstrations", type=int, default=50, help="episodes per task")
+    parser.add_argument("--steps", type=int, default=1200, help="gradient steps")
+    parser.add_argument("--rollouts", type=int, default=100, help="rollouts per task")
     chosen = parser.parse_args()
     config = laptop(chosen.profile, tasks=chosen.tasks, episodes_per_task=chosen.demonstrations)
     torch.set_num_threads(1)
@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: int) -> dict[str, object]:
-    """Train the base on the demonstrations of one task and let it act."""
+    """Fine-tune the base on one task's demonstrations and return its success rate."""
     episodes = sorted(store.episodes.episode_id[store.episodes.task == task])
     bundle = model.load_policy(config, normalisation.episode_stats(store, episodes))
     batches = Batches(store, episodes, config.chunk_size, config.batch_size, seed=config.seed)
@@ -41,8 +41,8 @@ def learn(task: str, store: FrameStore, config: Config, steps: int, rollouts: in
         bundle, prefix_cache.with_cached_prefixes(bundle, batches), config, steps=steps, progress=False
     )
     actor = PolicyActor(bundle, config.seed)
-    attempts = evaluate(actor, [task], rollout_seeds(rollouts), image_size=config.image_size, progress=False)
-    successes = sum(attempt["success"] for attempt in attempts)
+    rows = evaluate(actor, [task], rollout_seeds(rollouts), image_size=config.image_size, progress=False)
+    successes = sum(row["success"] for row in rows)
     low, high = wilson(successes, rollouts)
     return {
         "task": task,

@@ -1,7 +1,7 @@
-"""How far a training step is from what this machine's arithmetic allows.
+"""Time of a training step compared with the floor set by this machine's arithmetic.
 
-The floor is the floating-point operations of a step's matrix products over the rate at which one core of this machine
-multiplies matrices that fit into its cache: about what a step would take if it did nothing else.
+The floor is the floating-point operations of a step's matrix products divided by the rate at which one core multiplies
+matrices that fit into its cache.
 
     python benchmarks/floor.py
 """
@@ -15,8 +15,8 @@ from fedvla_lib.policy import model, prefix_cache
 from fedvla_lib.policy.training import flow_loss, local_train
 from report import laptop, median_seconds, options, recording, report, start
 
-STEPS = 10  # of each measurement of a training
-SIDE = 512  # of the matrices multiplied to find the machine's rate: they fit into a core's own cache
+STEPS = 10  # gradient steps per measurement
+SIDE = 512  # of the matrices that measure the machine's rate: they fit into a core's cache
 
 
 def main() -> None:
@@ -28,15 +28,18 @@ def main() -> None:
     episodes = list(store.episodes.episode_id)
     batches = Batches(store, episodes, config.chunk_size, config.batch_size, seed=1)
     bundle = model.load_policy(config, normalisation.episode_stats(store, episodes))
-    kept = prefix_cache.with_cached_prefixes(bundle, batches)
+    cached = prefix_cache.with_cached_prefixes(bundle, batches)
     rate = operations_per_second(chosen.repeats)
     rows = []
-    for name, supply in {"stored prefix": kept, "whole model, frozen prefix": batches}.items():
+    for name, supply in {"stored prefix": cached, "whole model, frozen prefix": batches}.items():
         with FlopCounterMode(display=False) as counter:
             flow_loss(bundle, supply.at(0)).backward()
-        step_s = median_seconds(
-            lambda supply=supply: local_train(bundle, supply, config, steps=STEPS, progress=False), chosen.repeats
-        ) / STEPS
+        step_s = (
+            median_seconds(
+                lambda supply=supply: local_train(bundle, supply, config, steps=STEPS, progress=False), chosen.repeats
+            )
+            / STEPS
+        )
         floor_s = counter.get_total_flops() / rate
         rows.append(
             {
@@ -52,7 +55,7 @@ def main() -> None:
 
 
 def operations_per_second(repeats: int) -> float:
-    """Return the rate of float32 matrix multiplication on one core, two operations a multiply-add."""
+    """Return the rate of float32 matrix multiplication on one core, counting two operations per multiply-add."""
     left, right = torch.randn(SIDE, SIDE), torch.randn(SIDE, SIDE)
     count = 20
 

@@ -1,8 +1,8 @@
 """Federated, centralized and every client alone, on the same rollouts, over several seeds.
 
-A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are the same ones. The best client
-of a run is chosen by these very rollouts, which favours it. A client alone takes its share of the steps, so
-these rates say what it gets for an equal total, not what it can do. Finished seeds are kept and not measured again.
+A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are always the same. The best
+client of a run is selected on the same rollouts, which favours it. A client alone takes its share of the gradient steps,
+so its rate is what it gets at an equal total, not what it can reach. Finished seeds are kept and not measured again.
 
     python benchmarks/four_methods.py
 """
@@ -24,7 +24,7 @@ from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle
 from report import cores, laptop, options, report, start
 
-STARTS_FROM = FIRST_SEED + 1000  # apart from the starting positions of the chapters
+STARTS_FROM = FIRST_SEED + 1000  # other starting positions than the chapters
 BEST = "best client alone"
 
 
@@ -32,8 +32,8 @@ def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the runs")
-    parser.add_argument("--rollouts", type=int, default=20, help="rollouts at each task, for each model and seed")
-    parser.add_argument("--threads", type=int, default=cores(), help="threads that a model computes on")
+    parser.add_argument("--rollouts", type=int, default=20, help="rollouts per task, model and seed")
+    parser.add_argument("--threads", type=int, default=cores(), help="threads per model")
     chosen = parser.parse_args()
     recording = recordings.resolve(laptop(chosen.profile))
     config = laptop(chosen.profile, num_threads=chosen.threads, data=str(recording))
@@ -42,26 +42,26 @@ def main() -> None:
 
 
 def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
-    """Return a row for each rollout of each model of a run."""
+    """Return one row per rollout and model of a run."""
     config = replace(config, seed=seed)
     run = methods.federated(config)
-    kept = chosen.out / "four_methods" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
-    if not kept.is_file():
+    file = chosen.out / "four_methods" / f"{run.parent.name}_{chosen.rollouts}.json"  # named by settings, base and code
+    if not file.is_file():
         starts = rollout_seeds(chosen.rollouts, first=STARTS_FROM)
         rows = [row for name, bundle in models(config) for row in rollouts(name, bundle, config, starts)]
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        write_json(kept, rows)
-    return pd.DataFrame(json.loads(kept.read_text())).assign(run=seed)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(file, rows)
+    return pd.DataFrame(json.loads(file.read_text())).assign(run=seed)
 
 
 def rollouts(name: str, bundle: Bundle, config: Config, starts: list[int]) -> list[dict[str, object]]:
-    """Return what a table of pairs needs of each rollout of a model."""
-    found = evaluate(PolicyActor(bundle, config.seed), task_names(config), starts, image_size=config.image_size)
-    return [{"method": name, "task": row["task"], "seed": row["seed"], "success": row["success"]} for row in found]
+    """Return the columns for paired comparisons, one row per rollout of a model."""
+    rows = evaluate(PolicyActor(bundle, config.seed), task_names(config), starts, image_size=config.image_size)
+    return [{"method": name, "task": row["task"], "seed": row["seed"], "success": row["success"]} for row in rows]
 
 
 def models(config: Config) -> Iterator[tuple[str, Bundle]]:
-    """Yield every model that is compared, with its name."""
+    """Yield the name and the model of every method and client."""
     yield "federated", methods.federated_policy(config)
     yield "centralized", methods.centralized(config)
     for client in range(config.num_clients):
@@ -69,17 +69,17 @@ def models(config: Config) -> Iterator[tuple[str, Bundle]]:
 
 
 def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
-    """Return a line for each method: successes with interval, and how far federated is ahead on the same rollouts."""
+    """Return a row per method: successes with interval, and federated's lead on the same rollouts."""
     alone = rows[rows.method.str.endswith(" alone")]
     best = pd.concat(
         [part[part.method == part.groupby("method").success.sum().idxmax()] for _, part in alone.groupby("run")]
     )
     counted = {"federated": rows[rows.method == "federated"], "centralized": rows[rows.method == "centralized"]}
     counted |= {BEST: best, "all clients alone": alone}
-    found = []
+    table = []
     for name, part in counted.items():
         (line,) = success_table(part.assign(method=name), ["method"]).to_dict("records")
-        found.append(
+        table.append(
             {
                 "method": name,
                 "runs": int(part.run.nunique()),
@@ -90,11 +90,11 @@ def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
                 "behind federated": behind(part, counted["federated"]),
             }
         )
-    return found
+    return table
 
 
 def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
-    """Say how far federated is ahead of a method, with interval; a pair is a task and a start in one run."""
+    """Return federated's lead over a method, with interval; rollouts are paired by run, task and start."""
     both = pd.concat([counted["federated"], counted[name].assign(method=name)])
     paired = both.assign(task=both.run.astype(str) + both.task)
     result = paired_difference(paired, "federated", name, seed=0)
@@ -102,7 +102,7 @@ def ahead_of(name: str, counted: dict[str, pd.DataFrame]) -> str:
 
 
 def behind(part: pd.DataFrame, federated: pd.DataFrame) -> str:
-    """Say how many models of a method succeeded less often than the federated model of their run."""
+    """Return how many models of a method succeeded less often than the federated model of their run."""
     rates, ours = part.groupby(["run", "method"]).success.mean(), federated.groupby("run").success.mean()
     return f"{sum(rate < ours[run] for (run, _), rate in rates.items())} of {len(rates)}"
 

@@ -27,7 +27,7 @@ from report import laptop, options, recording, report, start, timed
 def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=12, help="optimiser steps measured of each side")
+    parser.add_argument("--steps", type=int, default=12, help="gradient steps measured on each side")
     parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2], help="DataLoader workers to try")
     chosen = parser.parse_args()
     config = laptop(chosen.profile)
@@ -38,7 +38,7 @@ def main() -> None:
     stats = normalisation.episode_stats(store, episodes)
 
     ours = model.load_policy(config, stats)
-    with tempfile.TemporaryDirectory() as fresh:  # what an earlier run has stored would cost nothing
+    with tempfile.TemporaryDirectory() as fresh:  # without the cache of earlier runs
         stored_s = timed(lambda: prefix_cache.ensure_prefixes(ours, store, Path(fresh), progress=False))
     supply = prefix_cache.with_cached_prefixes(ours, batches)
     our_losses, our_s = train(ours, config, (supply.at(step) for step in range(chosen.steps)), chosen.steps)
@@ -63,7 +63,8 @@ def main() -> None:
 
 
 def train(bundle: model.Bundle, config: Config, batches: Iterator[dict], steps: int) -> tuple[list[float], float]:
-    """Train with the same noise on either side; return losses and seconds, the first step replaced by a usual one."""
+    """Train with the same noise on both sides; return losses and seconds, with the first (warm-up) step
+    counted as an average one."""
     optimizer, scheduler = make_optimizer(bundle, config, 0, 1000)
     bundle.policy.train()
     losses: list[float] = []
@@ -77,7 +78,7 @@ def train(bundle: model.Bundle, config: Config, batches: Iterator[dict], steps: 
 def one_step(
     bundle: model.Bundle, batch: dict, optimizer: torch.optim.Optimizer, scheduler: object, step: int
 ) -> float:
-    """One optimiser step on a raw batch, with a stored prefix or without."""
+    """Take one gradient step on a raw batch, with or without a cached prefix; return its loss."""
     generator = torch.Generator().manual_seed(step)
     settings = bundle.policy.config
     noise = torch.randn((len(batch["task"]), settings.chunk_size, settings.max_action_dim), generator=generator)
@@ -96,7 +97,7 @@ def one_step(
 
 
 def lerobot_batches(store: FrameStore, batches: Batches, steps: int, workers: int) -> torch.utils.data.DataLoader:
-    """LeRobot's own way to the same batches: decode the frames when they are asked for."""
+    """Return LeRobot's loader of the same batches, which decodes frames on access."""
     chunk = [step / FPS for step in range(batches.chunk_size)]
     dataset = LeRobotDataset(REPO_ID, root=store.root, delta_timestamps={ACTION_KEY: chunk}, video_backend="pyav")
     order = [batches.rows_at(step).tolist() for step in range(steps)]

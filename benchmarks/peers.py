@@ -1,7 +1,7 @@
 """Rendered control steps per second: this arm against two published simulators of its sister, the SO-101.
 
-Each peer runs in an environment of its own, made by uv from the package registry and kept in uv's cache, on its own
-pick scene, with pictures as small as ours where it lets us choose. A peer that cannot be installed is left out.
+Each peer runs in its own Python environment, installed by uv from the package registry and kept in uv's cache, on its
+own pick scene, with images as small as ours where their size can be set. A peer that cannot be installed is left out.
 
     python benchmarks/peers.py
 """
@@ -17,7 +17,7 @@ from control_steps import seconds_per_step
 from fedvla_lib.robot.sim import So100Env
 from report import laptop, options, report, start
 
-# What a peer's process does: make the environment, rest, and print seconds per step of control.
+# Runs in a peer's process after the code that makes `env`: prints the seconds per control step.
 TIMING = """
 import json, time
 env.reset(seed=0)
@@ -40,7 +40,7 @@ PLUGIN = """
 import gymnasium, lerobot_env_so101
 env = gymnasium.make("lerobot_env_so101/SO101PickCube-v0", image_obs=True, render_mode="rgb_array")
 """
-PEERS = {  # requirement -> (what makes its environment, cameras, pixels or None if we choose, control steps a second)
+PEERS = {  # requirement -> (code that makes `env`, cameras, pixels or None if adjustable, control steps per second)
     "so101-nexus==0.10.0": (NEXUS, 2, None, 50),
     "lerobot-env-so101==0.4.0": (PLUGIN, 1, 128, 10),
 }
@@ -49,8 +49,8 @@ PEERS = {  # requirement -> (what makes its environment, cameras, pixels or None
 def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=40, help="control steps of each measurement of ours")
-    parser.add_argument("--peer-steps", type=int, default=10, help="control steps of each measurement of a peer")
+    parser.add_argument("--steps", type=int, default=40, help="control steps per measurement of this library")
+    parser.add_argument("--peer-steps", type=int, default=10, help="control steps per measurement of a peer")
     parser.add_argument("--peers", nargs="*", default=list(PEERS), choices=list(PEERS), help="packages to measure")
     chosen = parser.parse_args()
     config = laptop(chosen.profile)
@@ -77,15 +77,15 @@ def _row(name: str, cameras: int, pixels: int, rate_hz: int, seconds: float, our
 
 
 def peer_seconds_per_step(peer: str, make: str, pixels: int, chosen: Namespace) -> float | None:
-    """Return the time of one control step of a peer, None if it cannot be installed or run here."""
-    beside = Path(__file__).parents[1] / ".uv/bin/uv"
-    uv = str(beside) if beside.is_file() else shutil.which("uv")
+    """Return the seconds of one control step of a peer, None if it cannot be installed or run."""
+    local = Path(__file__).parents[1] / ".uv/bin/uv"
+    uv = str(local) if local.is_file() else shutil.which("uv")
     if uv is None:
-        print(f"{peer}: left out, there is no uv to install it with", file=sys.stderr)
+        print(f"{peer}: left out, uv is not installed", file=sys.stderr)
         return None
     code = f"PIXELS, STEPS = {pixels}, {chosen.peer_steps}\n{make}{TIMING}"
-    place = [uv, "run", "--quiet", "--no-project", "--isolated", "--python", sys.executable, "--with", peer]
-    done = subprocess.run([*place, "python", "-c", code], capture_output=True, text=True, check=False)
+    isolated = [uv, "run", "--quiet", "--no-project", "--isolated", "--python", sys.executable, "--with", peer]
+    done = subprocess.run([*isolated, "python", "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         print(f"{peer}: left out, {reason}", file=sys.stderr)

@@ -1,6 +1,6 @@
 """Random access to training frames: the decoded store against LeRobot's data set, which decodes video.
 
-    python benchmarks/random_access.py
+python benchmarks/random_access.py
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from report import laptop, median_seconds, options, recording, report, start
 def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=64, help="frames read at each measurement, in random order")
+    parser.add_argument("--frames", type=int, default=64, help="frames read per measurement, in random order")
     chosen = parser.parse_args()
     config = laptop(chosen.profile)
     store = recording(config)

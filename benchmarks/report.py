@@ -1,7 +1,7 @@
-"""What every benchmark shares: one recording, one table, one JSON file. No test depends on a time.
+"""Shared by all benchmarks: options, the recording, timing, and the JSON report.
 
-Each script measures both sides in one run on one machine and prints their ratio. The speed of a machine cancels in a
-ratio; what else runs on it does not, so let nothing else run.
+Each script measures both sides in one run on one machine and prints their ratio. The speed of the machine cancels in
+the ratio; other load does not, so run nothing else.
 """
 
 import argparse
@@ -25,10 +25,10 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def options(text: str) -> argparse.ArgumentParser:
-    """Return a parser with what all benchmarks take."""
+    """Return a parser with the options of all benchmarks."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--profile", default="laptop", help="settings of model and data")
-    parser.add_argument("--repeats", type=int, default=5, help="measurements of each side; the median counts")
+    parser.add_argument("--profile", default="laptop", help="profile of model and data")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements on each side; the median is reported")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the JSON file")
     return parser
 
@@ -42,17 +42,17 @@ def start(main: Callable[[], None]) -> None:
 
 
 def recording(config: Config) -> FrameStore:
-    """Return the frames of the profile's own recording, made now if it is not in the cache."""
+    """Return the frames of the profile's recording, recorded now if it is not cached."""
     return open_store(recordings.resolve(config), image_size=config.image_size)
 
 
 def laptop(profile: str, **overrides: object) -> Config:
-    """Return the profile's settings on one thread, so that cores are counted by processes."""
+    """Return the profile's settings on one thread, so that cores equal processes."""
     return from_profile(profile, **{"num_threads": 1, **overrides})
 
 
 def median_seconds(work: Callable[[], object], repeats: int) -> float:
-    """Return the median wall time of `work` over `repeats` calls, after one that does not count."""
+    """Return the median wall time of `work` over `repeats` calls, after one warm-up call."""
     work()
     return statistics.median(timed(work) for _ in range(repeats))
 
@@ -65,13 +65,13 @@ def timed(work: Callable[[], object]) -> float:
 
 
 def peak_memory_mb() -> float:
-    """Return the most memory this process has held so far, in MB (Linux counts in KiB, macOS in bytes)."""
+    """Return this process's peak memory in MB (`ru_maxrss` is in KiB on Linux, in bytes on macOS)."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if platform.system() == "Darwin" else 1e3)
 
 
 def report(name: str, rows: list[dict[str, object]], out: Path) -> None:
-    """Print the rows and keep them with the machine they were measured on."""
+    """Print the rows and write them with a description of the machine to `out/name.json`."""
     for row in rows:
         print("  ".join(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"
                         for key, value in row.items()))  # fmt: skip
@@ -81,10 +81,10 @@ def report(name: str, rows: list[dict[str, object]], out: Path) -> None:
 
 
 def machine() -> dict[str, object]:
-    """Return what is told of the machine beside results."""
+    """Return the description of the machine stored with results."""
     return {"cores": cores(), "python": platform.python_version(), "system": platform.system()}
 
 
 def cores() -> int:
-    """Return the cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

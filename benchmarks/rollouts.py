@@ -1,9 +1,9 @@
 """Closed-loop rollouts per minute: this library against lerobot-eval, same policy, same environment, same seeds.
 
-Both sides drive 16 arms at a time, film the first ten attempts (lerobot-eval cannot be told otherwise) and draw the
-same noise: the policy's look number k at a scene has the k-th draw of one generator, whatever the seed of the scene, so
-that the same attempts should succeed. lerobot-eval is measured twice: on one core like this library, with its
-environments in its own process, and as it comes, with a process for each environment on all cores.
+Both sides run 16 environments at a time, record the first ten rollouts on video (fixed in lerobot-eval) and draw the
+same noise: the policy's k-th chunk in a scene uses the k-th draw of one generator, whatever the scene's seed, so the
+same rollouts should succeed. lerobot-eval is measured twice: on one core like this library, with all environments in
+its own process, and with its defaults, one process per environment on all cores.
 
     python benchmarks/rollouts.py --policy outputs/DATE_TIME/global_model/round_8
 """
@@ -26,7 +26,7 @@ from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
 from report import cores, laptop, options, report, start, timed
 
-FILMS = 10  # what lerobot-eval films, whatever it is told
+VIDEOS = 10  # fixed in lerobot-eval
 AS_LEROBOT = "as-lerobot-eval"  # first argument with which this script calls itself to run lerobot-eval
 
 
@@ -35,8 +35,10 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--policy", type=Path, required=True, help="a saved policy")
     parser.add_argument("--task", default="lift", help="the task")
-    parser.add_argument("--rollouts", type=int, default=96, help="attempts of each side")
-    parser.add_argument("--batch", type=int, default=rollouts.AT_ONCE, help="environments lerobot-eval runs at once")
+    parser.add_argument("--rollouts", type=int, default=96, help="rollouts on each side")
+    parser.add_argument(
+        "--batch", type=int, default=rollouts.AT_ONCE, help="environments that lerobot-eval runs at once"
+    )
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
     torch.set_num_threads(1)
@@ -46,7 +48,7 @@ def main() -> None:
 
 
 def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float, own_processes: bool) -> dict[str, Any]:
-    """Measure lerobot-eval one way and hold it against our rows."""
+    """Measure lerobot-eval in one mode and compare it with our rows."""
     with tempfile.TemporaryDirectory() as folder:
         theirs_s, successes = lerobot_eval(chosen, config, Path(folder), own_processes)
     return {
@@ -64,24 +66,29 @@ def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float,
 
 
 class SameNoise(PolicyActor):
-    """A policy that draws the same noise in every episode."""
+    """A policy that draws the same noise in every rollout."""
 
     def reset(self, env: Any, seed: int) -> None:
-        """Start an episode with the first draw."""
         super().reset(env, FIRST_SEED)
 
 
 def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
-    """Load the policy and roll out, as the command line does."""
+    """Load the policy and run the rollouts, as `fedvla evaluate` does."""
     actor = SameNoise(model.load_policy(config))
-    with tempfile.TemporaryDirectory() as films:
+    with tempfile.TemporaryDirectory() as videos:
         return rollouts.evaluate(
-            actor, [task], seeds, image_size=config.image_size, videos_dir=Path(films), num_videos=FILMS, progress=False
+            actor,
+            [task],
+            seeds,
+            image_size=config.image_size,
+            videos_dir=Path(videos),
+            num_videos=VIDEOS,
+            progress=False,
         )
 
 
 def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes: bool) -> tuple[float, list[bool]]:
-    """Run LeRobot's command; return the seconds it reports for its episodes, and whether each succeeded."""
+    """Run LeRobot's command; return the seconds that it reports, and the success of each rollout."""
     command = [
         sys.executable, __file__, AS_LEROBOT, f"--policy.path={chosen.policy}",
         "--policy.device=cpu", "--env.type=so100_sim", f"--env.task={chosen.task}",
@@ -93,21 +100,20 @@ def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes:
     first = min(os.sched_getaffinity(0))
     pinned = None if own_processes else lambda: os.sched_setaffinity(0, {first})
     subprocess.run(command, check=True, capture_output=True, env=settings, preexec_fn=pinned)
-    found = json.loads((folder / "out" / "eval_info.json").read_text())
-    one = found["per_task"][0]["metrics"]
-    return found["overall"]["eval_s"], list(one["successes"])
+    results = json.loads((folder / "out" / "eval_info.json").read_text())
+    return results["overall"]["eval_s"], list(results["per_task"][0]["metrics"]["successes"])
 
 
 def as_lerobot_eval() -> None:
-    """LeRobot's command with the noise of `SameNoise`: its policy's own methods, told which numbers to draw."""
+    """Run LeRobot's command with its policy patched to draw the noise of `SameNoise`."""
     from lerobot.policies.smolvla import SmolVLAPolicy
     from lerobot.policies.smolvla.modeling_smolvla import VLAFlowMatching
     from lerobot.scripts.lerobot_eval import main as evaluate_policy
 
-    forget, source = SmolVLAPolicy.reset, SameNoise(bundle=None)
+    original_reset, source = SmolVLAPolicy.reset, SameNoise(bundle=None)
 
     def reset(policy: SmolVLAPolicy) -> None:
-        forget(policy)
+        original_reset(policy)
         source.reset(Namespace(instruction=""), FIRST_SEED)
 
     def sample_noise(_: VLAFlowMatching, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:

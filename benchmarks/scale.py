@@ -1,10 +1,10 @@
-"""What a round costs with 10, 100 and 1,000 clients, in time and memory: in this process, and on Flower's runtime.
+"""Time and memory of a round with 10, 100 and 1,000 clients: inline, and on Flower's simulation runtime.
 
     python benchmarks/scale.py --profile tiny
 
-Every client trains in every round, on one episode, so the work grows with the clients. Scale needs episodes, not
-variety: the profile's recording is repeated until there is one for each client. Rows that are measured replace those
-of the same engine and number of clients; the others stay, if they are of a machine like this one.
+Every client trains in every round, on one episode. The profile's recording is repeated until there is an episode for
+each client. Measured rows replace those of the same engine and number of clients; the others are kept if they are from
+a machine like this one.
 """
 
 import json
@@ -29,23 +29,25 @@ from fedvla_lib.engines import inline, simulation
 from fedvla_lib.run_folder import GLOBAL, read_events
 from report import laptop, machine, options, report, start
 
-MARK = "FEDVLA_BENCHMARK"  # in the environment of every process of one measurement
+MARK = "FEDVLA_BENCHMARK"  # environment variable that marks the processes of one measurement
 ENGINES = {"inline": inline.run_inline, "simulation": simulation.run_simulation}
 MERGED_AT_ONCE = 6
 PER_CLIENT, RATIO = "later, per client [ms]", "against fewer clients"
 
 
 def main() -> None:
-    """Measure each engine with each number of clients, in processes of their own, and report."""
+    """Measure each engine with each number of clients, in separate processes, and report."""
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--clients", type=int, nargs="+", default=[10, 100, 1000], help="numbers of clients")
-    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES), help="who calls the clients")
-    parser.add_argument("--rounds", type=int, default=2, help="rounds; the first, which starts workers, is apart")
-    parser.add_argument("--alone", help="used by this script: the settings of one measurement, as JSON")
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES), help="engines")
+    parser.add_argument(
+        "--rounds", type=int, default=2, help="rounds; the first, which starts workers, is reported separately"
+    )
+    parser.add_argument("--alone", help="used internally: the settings of one measurement, as JSON")
     chosen = parser.parse_args()
     if chosen.alone:
-        wanted = json.loads(chosen.alone)
-        ENGINES[wanted.pop("engine")](laptop(chosen.profile, **wanted))
+        settings = json.loads(chosen.alone)
+        ENGINES[settings.pop("engine")](laptop(chosen.profile, **settings))
         return
     again = {(name, count) for name in chosen.engines for count in chosen.clients}
     rows = [row for row in kept(chosen.out) if (row["engine"], row["clients"]) not in again]
@@ -55,7 +57,7 @@ def main() -> None:
             for name in chosen.engines:
                 settings = light(episodes, count, chosen.rounds, Path(folder) / f"{name}_{count}")
                 rows.append({"engine": name, "clients": count, **measure({"engine": name, **settings}, chosen.profile)})
-                report("scale", compared(rows), chosen.out)  # each time: the last are long, what is known is kept
+                report("scale", compared(rows), chosen.out)  # each time, because the last rows take long
 
 
 def kept(out: Path) -> list[dict[str, object]]:
@@ -66,34 +68,34 @@ def kept(out: Path) -> list[dict[str, object]]:
 
 
 def compared(rows: list[dict[str, object]]) -> list[dict[str, object]]:
-    """Sort rows by engine and clients, and set each one's cost by client against that of the row with fewer clients.
+    """Sort rows by engine and clients, and add each one's cost per client relative to the row with fewer clients.
 
-    One is a flat cost; ten times the clients at a cost that grows with their square would give ten.
+    1 is a constant cost per client; with ten times the clients, a quadratic cost would give 10.
     """
-    whole, before = [], {}
+    table, before = [], {}
     for row in sorted(rows, key=lambda row: (list(ENGINES).index(row["engine"]), row["clients"])):
         cost = row[PER_CLIENT]
         ratio = cost / before[row["engine"]] if row["engine"] in before else None
-        whole.append({**row, RATIO: ratio})
+        table.append({**row, RATIO: ratio})
         before[row["engine"]] = cost
-    return whole
+    return table
 
 
 def repeated(config: Config, count: int, folder: Path) -> Path:
     """Write a data set that repeats the profile's recording until `count` clients have an episode to train on."""
     path, k = Path(recordings.resolve(config)), 0
-    wanted = count + len(task_names(config))  # of each task one is held out
+    wanted = count + len(task_names(config))  # one episode per task is held out
     while (have := LeRobotDataset("local/part", root=path)).num_episodes < wanted:
         times = min(MERGED_AT_ONCE, -(-wanted // have.num_episodes))
         k += 1
         path = folder / f"data_{k}"
         merge_datasets([have] * times, f"local/merged_{k}", path)
-        _say_where_episodes_are(path)
+        _correct_file_index(path)
     return path
 
 
-def _say_where_episodes_are(root: Path) -> None:
-    """Correct each episode's note of the metadata file it is in, which LeRobot's merge leaves wrong."""
+def _correct_file_index(root: Path) -> None:
+    """Correct the metadata file index of each episode, which LeRobot's merge leaves wrong."""
     for file in root.glob("meta/episodes/chunk-*/file-*.parquet"):
         chunk, number = (int(name.split("-")[1]) for name in (file.parent.name, file.stem))
         table = pd.read_parquet(file)
@@ -102,9 +104,9 @@ def _say_where_episodes_are(root: Path) -> None:
 
 
 def light(episodes: Path, count: int, rounds: int, out: Path) -> dict[str, object]:
-    """Return settings under which clients do one local step, and nobody drives the arm.
+    """Return settings with one local step per client and no rollouts.
 
-    Pictures are jittered, which turns the store of prefixes off: for one step a client it is more work than it saves.
+    Image augmentation disables the prefix cache, which for one step per client costs more than it saves.
     """
     return {
         "data": str(episodes), "num_clients": count, "num_server_rounds": rounds, "fraction_train": 1.0,
@@ -114,7 +116,7 @@ def light(episodes: Path, count: int, rounds: int, out: Path) -> dict[str, objec
 
 
 def measure(settings: dict, profile: str) -> dict[str, float]:
-    """Run one federation in processes of its own; return seconds of its rounds and the most memory they held."""
+    """Run one federation in separate processes; return the seconds of its rounds and peak memory."""
     environment = {**os.environ, MARK: (mark := uuid.uuid4().hex)}
     command = [sys.executable, __file__, "--profile", profile, "--alone", json.dumps(settings)]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -122,11 +124,11 @@ def measure(settings: dict, profile: str) -> dict[str, float]:
     done = threading.Event()
     watcher = threading.Thread(target=_watch, args=(mark, peaks, done))
     watcher.start()
-    _, said = process.communicate()
+    _, stderr = process.communicate()
     done.set()
     watcher.join()
     if process.returncode:
-        raise RuntimeError(f"{settings['engine']} with {settings['num_clients']} clients: {said.splitlines()[-1]}")
+        raise RuntimeError(f"{settings['engine']} with {settings['num_clients']} clients: {stderr.splitlines()[-1]}")
     (run,) = Path(settings["out"]).glob("*/")
     first, *later = round_seconds(run)
     warm, count = statistics.median(later), settings["num_clients"]
@@ -137,7 +139,7 @@ def measure(settings: dict, profile: str) -> dict[str, float]:
 
 
 def round_seconds(run: Path) -> list[float]:
-    """Return how long each round took, from the end of the one before to its own."""
+    """Return the seconds of each round, from the end of the previous one to its own."""
     events = read_events(run)
     measured = [event for event in events if (event["who"], event["kind"]) == (GLOBAL, "evaluate")]
     ends = [datetime.fromisoformat(event["time"]) for event in measured]
@@ -150,14 +152,14 @@ def _watch(mark: str, peaks: list[float], done: threading.Event) -> None:
 
 
 def _memory_mb(process: psutil.Process, mark: str) -> float:
-    """Return a marked process's memory, its part of what it shares with others included once; else 0."""
+    """Return a marked process's memory in MB, shared pages counted proportionally (PSS); 0 for other processes."""
     try:
         if process.environ().get(MARK) != mark:
             return 0.0
-        held = process.memory_full_info()
-    except (psutil.Error, OSError):  # it ended meanwhile, or is not ours to look into
+        memory = process.memory_full_info()
+    except (psutil.Error, OSError):  # it has ended, or access is denied
         return 0.0
-    return getattr(held, "pss", held.uss) / 1e6
+    return getattr(memory, "pss", memory.uss) / 1e6
 
 
 if __name__ == "__main__":
