@@ -460,7 +460,7 @@ def test_personal_parts_stay_with_their_client(tiny):
     for _, _, message, reply, _ in trained:
         for arrays in (message.content[messages.ARRAYS], reply.content[messages.ARRAYS]):
             assert "projections" not in {layer_of(name) for name in arrays}
-    own = [messages.unpack_arrays(context.state[client_app.OWN]) for _, _, _, _, context in trained[-2:]]
+    own = [messages.unpack_arrays(context.state[client_app.PERSONAL]) for _, _, _, _, context in trained[-2:]]
     assert {layer_of(name) for name in own[0]} == {"projections"}
     assert all(not np.array_equal(own[0][name], own[1][name]) for name in own[0])
     assert all(not np.array_equal(own[0][name], start[name]) for name in own[0])

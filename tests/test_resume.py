@@ -167,7 +167,7 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
     for folder in (done / "checkpoints").glob("round_*"):
         (folder / "arrays.safetensors").write_bytes(b"half of it")
     assert main(["run", "--resume", str(done)]) == 2
-    assert "no checkpoint before it is whole" in capsys.readouterr().err
+    assert "no intact checkpoint before it" in capsys.readouterr().err
     assert json.loads((done / "stamp.json").read_text())["status"].startswith("failed")
 
 
@@ -179,8 +179,8 @@ def test_an_engine_that_cannot_reach_what_clients_keep_says_so_instead_of_resumi
     run.log(2, "global", "evaluate", {"loss": 1.0})
     for setting, value in KEEPING.items():
         with pytest.raises(ValueError, match="lets clients keep something .* resume on engine inline, or start anew"):
-            server_app._before(replace(resumed, **{setting: value}), run, None)
-    assert server_app._before(resumed, run, None).round == 2
+            server_app._resume_from(replace(resumed, **{setting: value}), run, None)
+    assert server_app._resume_from(resumed, run, None).round == 2
 
 
 @pytest.mark.unit
@@ -224,7 +224,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(tmp_path, par
     assert found.round == 1 and getattr(found, part)["w"].tolist() == [1, 1, 1]
     assert f"{tmp_path}/checkpoints/round_2 is damaged" in caplog.text and "round_1" not in caplog.text
     DAMAGES[damage](tmp_path / f"checkpoints/round_1/{part}.safetensors")
-    with pytest.raises(ValueError, match="round_1 is damaged .* no checkpoint before it is whole"):
+    with pytest.raises(ValueError, match="round_1 is damaged .* no intact checkpoint before it"):
         checkpoint.load(tmp_path)
 
 

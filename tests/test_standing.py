@@ -136,7 +136,7 @@ def test_connections_of_ones_own_stay_and_one_in_the_way_is_named(tmp_path):
     ("device", "cards", "chosen"), [("cpu", [], "cpu"), ("cpu", ["0"], "cuda"), ("mps", ["0"], "mps")]
 )
 def test_a_client_computes_on_the_card_that_is_reserved_for_it(device, cards, chosen):
-    assert client_app.on_reserved_card(from_profile("tiny", device=device), cards).device == chosen
+    assert client_app.on_reserved_gpu(from_profile("tiny", device=device), cards).device == chosen
 
 
 @pytest.mark.unit

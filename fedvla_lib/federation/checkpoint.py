@@ -1,4 +1,4 @@
-"""Checkpoints of a federated run, one a round: global arrays, the strategy's state and the clients' states.
+"""Checkpoints of a federated run, one per round: global arrays, the strategy's state and the clients' states.
 
 ::
 
@@ -62,15 +62,15 @@ def load(root: Path) -> Checkpoint:
         ValueError: there is none.
     """
     if not (rounds := sorted(_rounds(root), reverse=True)):
-        raise ValueError(f"{root} has no checkpoint: no round of it was completed, so start it anew")
+        raise ValueError(f"{root} has no checkpoint: no round was completed; start a new run")
     for number in rounds:
         folder = root / "checkpoints" / f"round_{number}"
         try:
             return Checkpoint(number, **{part: _read(folder / f"{part}.safetensors") for part in PARTS})
         except (SafetensorError, OSError, ParameterError) as error:
             damage = f"{folder} is damaged ({error})"
-            logger.warning("%s: looking for the round before", damage)
-    raise ValueError(f"{damage}, and no checkpoint before it is whole: start the run anew")
+            logger.warning("%s: trying the round before", damage)
+    raise ValueError(f"{damage}, and there is no intact checkpoint before it: start a new run")
 
 
 def _read(file: Path) -> Arrays:

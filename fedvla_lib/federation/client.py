@@ -72,18 +72,12 @@ class Client:
             correction: changes gradients, as the strategy asks.
             moments: optimiser state after this client's last round; None starts fresh.
         """
-        config = self.config
+        config, steps = self.config, self.config.local_steps
         return training.local_train(
-            bundle,
-            prefix_cache.with_cached_prefixes(bundle, self.batches()),
-            config,
-            steps=config.local_steps,
-            start=training.Start(
-                (round_number - 1) * config.local_steps, config.num_server_rounds * config.local_steps, moments
-            ),
-            objective=training.Objective(correction=correction),
-            progress=False,
-        )
+            bundle, prefix_cache.with_cached_prefixes(bundle, self.batches()), config, steps=steps,
+            start=training.Start((round_number - 1) * steps, config.num_server_rounds * steps, moments),
+            objective=training.Objective(correction=correction), progress=False,
+        )  # fmt: skip
 
     def batches(self) -> Batches:
         """Training batches; the random stream is the client's own."""
@@ -102,16 +96,15 @@ class Client:
 
         Seeds and the first task differ between clients, so that they do not all show the same scene.
         """
-        held = tasks_of(self.store, self.share.train_ids)
-        own = labs_of(self.store, self.share.train_ids, self.config)
+        tasks = tasks_of(self.store, self.share.train_ids)
+        labs = labs_of(self.store, self.share.train_ids, self.config)
         seeds = rollout_seeds(self.config.client_rollouts, FIRST_SEED + CLIENT_SEEDS * (self.partition_id + 1))
         actor = PolicyActor(bundle, self.config.seed)
         rows = []
-        for turn, seed in enumerate(seeds if held else []):
-            task = held[(self.partition_id + turn) % len(held)]
-            where = own[turn % len(own)]
+        for turn, seed in enumerate(seeds if tasks else []):
+            task, lab = tasks[(self.partition_id + turn) % len(tasks)], labs[turn % len(labs)]
             rows += evaluate(
-                actor, [task], [seed], image_size=self.config.image_size, labs=[where], videos_dir=videos_dir,
+                actor, [task], [seed], image_size=self.config.image_size, labs=[lab], videos_dir=videos_dir,
                 progress=False,
             )  # fmt: skip
         return rows

@@ -26,13 +26,17 @@ from fedvla_lib.policy.parameters import Arrays, digest, load_arrays, shapes_of,
 from fedvla_lib.policy.training import Correction, Parameters
 
 # Keys of what a client keeps in its state between rounds, beside SCAFFOLD's control variate.
-MOMENTS = "moments"  # of its optimiser
-OWN = "own"  # personal parts of the model
+MOMENTS = "moments"  # optimiser state
+PERSONAL = "own"  # personal parts of the model
 LEFT_OVER = "left-over"  # rounding error of its updates so far
 
 
 def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
-    """Return the ClientApp with handlers for query (statistics), train and evaluate; `mods` are Flower's, outermost first."""
+    """Return the ClientApp, with handlers for query (statistics), train and evaluate.
+
+    Args:
+        mods: Flower's mods around the handlers, outermost first.
+    """
     app = ClientApp(mods=list(mods))
 
     @app.query()
@@ -69,11 +73,9 @@ def _trained(client: Client, bundle: Bundle, message: Message, context: Context)
     result = client.train(bundle, message.content[messages.CONFIG][messages.ROUND], correction, moments)
     arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
     metrics = {
-        messages.EXAMPLES: result.num_examples,
-        messages.STEPS: result.steps,
-        "loss": sum(result.losses) / len(result.losses),
-        "seconds": result.seconds,
-    }
+        messages.EXAMPLES: result.num_examples, messages.STEPS: result.steps,
+        "loss": sum(result.losses) / len(result.losses), "seconds": result.seconds,
+    }  # fmt: skip
     content = RecordDict({
         messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: MetricRecord(metrics),
         messages.NOTE: messages.make_note(sha256=digest(arrays)),
@@ -83,7 +85,7 @@ def _trained(client: Client, bundle: Bundle, message: Message, context: Context)
         context.state[MOMENTS] = messages.pack_arrays(result.moments)
     if bundle.own:
         trained = trainable_arrays(bundle.policy)
-        context.state[OWN] = messages.pack_arrays({name: trained[name] for name in bundle.own})
+        context.state[PERSONAL] = messages.pack_arrays({name: trained[name] for name in bundle.own})
     return content
 
 
@@ -97,25 +99,25 @@ def _evaluated(client: Client, bundle: Bundle, round_number: int) -> RecordDict:
     })  # fmt: skip
 
 
-def reserved_cards() -> list[str]:
+def reserved_gpus() -> list[str]:
     """Return the GPUs that Flower's simulation runtime has reserved for this client; none on other engines."""
-    # Its workers run in Ray, where Ray is loaded; on other engines it is not loaded for this question.
+    # The runtime's workers have loaded Ray already; elsewhere importing it would only cost time.
     ray = sys.modules.get("ray")
     if ray is None or not ray.is_initialized():
         return []
     return ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
 
 
-def on_reserved_card(config: Config, cards: Sequence[str]) -> Config:
+def on_reserved_gpu(config: Config, gpus: Sequence[str]) -> Config:
     """Return the settings with device cuda if a GPU is reserved for the client and they name no other device.
 
     GPUs are reserved by Flower's connection, which the settings of a run do not know.
     """
-    return replace(config, device="cuda") if cards and config.device == Config.device else config
+    return replace(config, device="cuda") if gpus and config.device == Config.device else config
 
 
 def _client(context: Context, loaders: Loaders) -> Client:
-    config = on_reserved_card(from_run_config(context.run_config), reserved_cards())
+    config = on_reserved_gpu(from_run_config(context.run_config), reserved_gpus())
     if messages.PARTITION not in context.node_config:
         raise ValueError(f"this node has no {messages.PARTITION}: start it with --node-config 'partition-id=K'")
     own_data = str(context.node_config.get(messages.DATA, ""))
@@ -131,13 +133,11 @@ def correction_for(message: Message, context: Context, parameters: Parameters) -
     Raises:
         ParameterError: the control variates are invalid.
     """
-    if messages.CONTROL in message.content:
-        shapes = shapes_of(parameters)
-        server = messages.checked_arrays(
-            message.content, messages.CONFIG, shapes, messages.CONTROL, also=(messages.ARRAYS,)
-        )
+    content, shapes = message.content, shapes_of(parameters)
+    if messages.CONTROL in content:
+        server = messages.checked_arrays(content, messages.CONFIG, shapes, messages.CONTROL, also=(messages.ARRAYS,))
         return ControlVariates(server, _load_state(context, messages.CONTROL))
-    mu = message.content[messages.CONFIG].get(messages.PROXIMAL_MU, 0.0)
+    mu = content[messages.CONFIG].get(messages.PROXIMAL_MU, 0.0)
     return Proximal(parameters, mu) if mu else None
 
 
@@ -167,16 +167,13 @@ def _load_state(context: Context, what: str) -> Arrays:
 
 def _policy(client: Client, message: Message, loaders: Loaders, context: Context) -> Bundle:
     """Return the policy with the checked global arrays of the message and the client's personal parts."""
-    own = client.config.normalisation == "own"
-    sent = message.content[messages.CONFIG][messages.STATS]
-    stats = client.statistics() if own else normalisation.unpack_stats(sent)
-    bundle = loaders.load_policy(client.config, stats)
-    exchange = DOWNWARD[client.config.exchange]
-    shapes = shapes_of(bundle.shared())
-    arrays = messages.checked_arrays(
-        message.content, messages.CONFIG, shapes, also=(messages.CONTROL,), exchange=exchange
-    )
-    load_arrays(bundle.policy, arrays | (_load_state(context, OWN) or bundle.own))
+    content, config = message.content, client.config
+    sent = content[messages.CONFIG][messages.STATS]
+    stats = client.statistics() if config.normalisation == "own" else normalisation.unpack_stats(sent)
+    bundle = loaders.load_policy(config, stats)
+    shapes, exchange = shapes_of(bundle.shared()), DOWNWARD[config.exchange]
+    arrays = messages.checked_arrays(content, messages.CONFIG, shapes, also=(messages.CONTROL,), exchange=exchange)
+    load_arrays(bundle.policy, arrays | (_load_state(context, PERSONAL) or bundle.own))
     return bundle
 
 

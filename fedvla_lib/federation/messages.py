@@ -67,7 +67,7 @@ def checked_arrays(
     also: tuple[str, ...] = (),
     exchange: str = "float32",
 ) -> Arrays:
-    """Unpack `record` and check names, shapes, finiteness and the SHA-256 that record `digest_in` announces.
+    """Unpack `record` and check names, shapes, finiteness and the SHA-256 in record `digest_in`.
 
     Args:
         also: other records of arrays that are allowed.
@@ -78,11 +78,11 @@ def checked_arrays(
     """
     key = {ARRAYS: DIGEST, CONTROL: CONTROL_DIGEST}[record]
     announced = content.config_records.get(digest_in, {}).get(key)
-    if record not in content.array_records or set(content.array_records) - {record, *also}:
-        found = list(content.array_records)
-        raise ParameterError("names", f"expected one record {record!r} of arrays, got {found}")
+    names = list(content.array_records)
+    if record not in names or set(names) - {record, *also}:
+        raise ParameterError("names", f"expected one record {record!r} of arrays, got {names}")
     if not isinstance(announced, str):
-        raise ParameterError("hash", f"no SHA-256 was announced under {digest_in}.{key}")
+        raise ParameterError("hash", f"there is no SHA-256 under {digest_in}.{key}")
     arrays = unpack_arrays(content.array_records[record])
     if exchange == "float32":
         check_arrays(arrays, shapes, announced)
@@ -94,7 +94,7 @@ def checked_arrays(
 
 def count_bytes(content: RecordDict) -> int:
     """Return the bytes of a message's records: arrays as Flower counts them, the rest as serialised."""
-    # Not the rest as Flower counts it: `ConfigRecord.count_bytes` fails on an empty list or text.
+    # Flower's `ConfigRecord.count_bytes` fails on an empty list or text.
     rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
     return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
 
@@ -110,23 +110,21 @@ class Rollouts:
 def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
     """Return rows and the files of `folder` as a note, so that they reach the server on every engine."""
     files = sorted(folder.iterdir())
-    named = [{**row, "video": Path(row["video"]).name} for row in rows]
-    return make_note(
-        rollouts=json.dumps(named), file_names=[f.name for f in files], files=[f.read_bytes() for f in files]
-    )
+    rollouts = json.dumps([{**row, "video": Path(row["video"]).name} for row in rows])
+    return make_note(rollouts=rollouts, file_names=[f.name for f in files], files=[f.read_bytes() for f in files])
 
 
 def unpack_rollouts(content: RecordDict) -> Rollouts:
     """Return the rollouts of an evaluation reply.
 
     Raises:
-        ParameterError: they cannot be read, or a file name is not a rollout's: a client must not choose where the server
-            writes.
+        ParameterError: they cannot be read, or a file name is not a rollout's, so that a client cannot choose where the
+            server writes.
     """
-    answer = content.config_records.get(NOTE, {})
+    note = content.config_records.get(NOTE, {})
     try:
-        rows = json.loads(answer["rollouts"])
-        files = dict(zip(answer["file-names"], answer["files"], strict=True))
+        rows = json.loads(note["rollouts"])
+        files = dict(zip(note["file-names"], note["files"], strict=True))
         flat = not any(isinstance(value, dict | list) for row in rows for value in row.values())
         usable = flat and all(row["video"] in files for row in rows)
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
@@ -168,8 +166,8 @@ def _check_npy(name: str, array: Array) -> None:
         raise ValueError(f".npy version {version}, expected one of {sorted(NPY_HEADERS)}")
     shape, _, dtype = NPY_HEADERS[version](file)
     if dtype.kind not in "biufc" or str(dtype) != array.dtype:
-        raise ParameterError("dtype", f"array {name!r} holds {dtype}, expected numbers, as declared {array.dtype!r}")
+        raise ParameterError("dtype", f"array {name!r} holds {dtype}, expected numbers of the declared {array.dtype!r}")
     if shape != tuple(array.shape):
-        raise ParameterError("shape", f"array {name!r} has shape {shape}, declared was {tuple(array.shape)}")
+        raise ParameterError("shape", f"array {name!r} has shape {shape}, declared as {tuple(array.shape)}")
     if (wanted := math.prod(shape) * dtype.itemsize) != (found := len(array.data) - file.tell()):
-        raise ParameterError("shape", f"array {name!r} of shape {shape} takes {wanted} bytes, {found} came")
+        raise ParameterError("shape", f"array {name!r} of shape {shape} needs {wanted} bytes, has {found}")

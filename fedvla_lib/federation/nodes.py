@@ -90,23 +90,23 @@ def introduce_nodes(
     """
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
     replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
-    known: dict[int, Introduction] = {}
+    introductions: dict[int, Introduction] = {}
     for reply in replies:
         try:
-            known[reply.metadata.src_node_id] = _introduction(reply, known.values())
+            introductions[reply.metadata.src_node_id] = _introduction(reply, introductions.values())
         except ParameterError as error:
             values = {"to": "query", "reason": error.kind, "detail": str(error)}
             report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
-    by_partition = sorted(known, key=lambda node: known[node].partition_id)
-    partitions = {node: known[node].partition_id for node in by_partition}
-    examples = {node: known[node].num_examples for node in by_partition}
-    return Roster(partitions, examples), [known[node] for node in by_partition]
+    ordered = dict(sorted(introductions.items(), key=lambda item: item[1].partition_id))
+    partitions = {node: one.partition_id for node, one in ordered.items()}
+    examples = {node: one.num_examples for node, one in ordered.items()}
+    return Roster(partitions, examples), list(ordered.values())
 
 
 def answered(reply: Message | None) -> Message:
     """Return `reply` if it has content; raise ParameterError for no reply or an error reply."""
     if reply is None:
-        raise ParameterError("silent", "no reply came in time")
+        raise ParameterError("silent", "no reply in time")
     if reply.has_error():
         raise ParameterError("error", " ".join(str(reply.error.reason).split()) or f"error code {reply.error.code}")
     return reply
@@ -157,7 +157,7 @@ def _check_measures(key: str, measures: dict[str, np.ndarray]) -> None:
         if value.dtype.kind != kind or value.shape != (length,):
             found = f"{value.dtype} {value.shape}"
             raise ParameterError("statistics", f"{key}.{name} is {found}, expected {length} numbers")
-        if not (np.abs(value) <= LARGEST).all():  # NaN is not smaller either
+        if not (np.abs(value) <= LARGEST).all():  # also false for NaN
             raise ParameterError("statistics", f"{key}.{name} holds values that are not finite in float32")
     mean, lowest, highest = measures["mean"], measures["min"], measures["max"]
     if (measures["std"] < 0).any():

@@ -10,11 +10,7 @@ import numpy as np
 
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes
 
-DOWNWARD = {
-    "float32": "float32",
-    "float16": "float16",
-    "int8": "float16",
-}  # exchange -> type in which the server sends the model
+DOWNWARD = {"float32": "float32", "float16": "float16", "int8": "float16"}  # exchange -> type of the server's arrays
 SCALE = "|scale"  # beside an int8 array: the value of one step
 LEVELS = 127  # int8 without -128, so that the range is symmetric
 

@@ -18,10 +18,9 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, client, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
-from fedvla_lib.federation.messages import Rollouts
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
-from fedvla_lib.federation.strategies import checked
 from fedvla_lib.federation.strategies.build import build_strategy
+from fedvla_lib.federation.strategies.checked import Checked
 from fedvla_lib.federation.throttled_grid import for_simulation
 from fedvla_lib.policy import model
 from fedvla_lib.policy.parameters import Arrays, load_arrays, shapes_of
@@ -82,20 +81,20 @@ def federate(
         ValueError: unusable settings or data.
     """
     check_tasks(task_names(config))
-    before = _before(config, run, states)
+    saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster, weights, pooled = _introduce(grid, config, run)
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.judging_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
-    if before:  # in the model's order, not the file's
-        arrays, done = {name: before.arrays[name] for name in arrays}, before.round
+    if saved:  # in the model's order, not the file's
+        arrays, done = {name: saved.arrays[name] for name in arrays}, saved.round
     strategy = build_strategy(
         config, weights, roster=roster, shapes=shapes_of(arrays), report=run.log,
         keep_rollouts=partial(_keep_rollouts, run), rounds_done=done,
     )  # fmt: skip
-    if before:
-        strategy.load_state(checkpoint.nested(before.strategy))
+    if saved:
+        strategy.load_state(checkpoint.nested(saved.strategy))
     evaluator = GlobalEvaluator(config, store, bundle, run, progress)
     packed = normalisation.pack_stats(stats)
     strategy.start(
@@ -114,31 +113,31 @@ class RoundEnd:
     """Evaluates the global model of a round and writes a checkpoint. Flower calls it first for round 0."""
 
     evaluator: "GlobalEvaluator"
-    strategy: checked.Checked
+    strategy: Checked
     run: RunFolder
     states: ClientStates | None
     done: int  # rounds that an earlier process completed
 
-    def __call__(self, flowers_round: int, record: ArrayRecord) -> MetricRecord | None:
+    def __call__(self, flower_round: int, record: ArrayRecord) -> MetricRecord | None:
         """End a round, unless an earlier process already did."""
-        if self.done and flowers_round == 0:
+        if self.done and flower_round == 0:
             return None
-        number = self.done + flowers_round
+        number = self.done + flower_round
         measured = self.evaluator(number, record)
-        memory, kept = self.strategy.state(), self.states.client_states() if self.states else {}
-        arrays = messages.unpack_arrays(record)
-        checkpoint.save(self.run.root, Checkpoint(number, arrays, checkpoint.flat(memory), checkpoint.flat(kept)))
+        strategy = checkpoint.flat(self.strategy.state())
+        clients = checkpoint.flat(self.states.client_states() if self.states else {})
+        checkpoint.save(self.run.root, Checkpoint(number, messages.unpack_arrays(record), strategy, clients))
         return measured
 
 
-def _before(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
+def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
     """Return the checkpoint to resume from, and remove what was written of later rounds."""
     if not config.resume:
         return None
-    kept_by_clients = [name for name, kept in client.kept_between_rounds(config).items() if kept]
-    if kept_by_clients and not states:
+    settings = [setting for setting, kept in client.kept_between_rounds(config).items() if kept]
+    if settings and not states:
         raise ValueError(
-            f"{kept_by_clients[0]} makes clients keep state between rounds, which is lost when a run ends on this "
+            f"{settings[0]} makes clients keep state between rounds, which is lost when a run ends on this "
             "engine: resume on engine inline, or start a new run"
         )
     found = checkpoint.load(run.root)
@@ -175,9 +174,8 @@ class GlobalEvaluator:
         )  # fmt: skip
         measure.log_measurement(self.run, round_number, GLOBAL, found)
         values = found.averages | found.success() | found.success_by_task(task_names(self.config))
-        seconds = time.perf_counter() - started
-        counted = {"num_examples": found.num_examples}
-        self.run.log(round_number, GLOBAL, "evaluate", {**counted, **values, "seconds": seconds})
+        counted = {"num_examples": found.num_examples, **values, "seconds": time.perf_counter() - started}
+        self.run.log(round_number, GLOBAL, "evaluate", counted)
         return MetricRecord(values)
 
 
@@ -195,20 +193,19 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict
         )
     for one in introductions if not config.resume else []:
         run.log(0, client_name(one.partition_id), "data", {"num_examples": one.num_examples})
-    whole = sum(one.num_examples for one in introductions)
-    weights = {node: one.num_examples / whole for node, one in zip(roster.partition_of, introductions, strict=True)}
+    total = sum(one.num_examples for one in introductions)
+    weights = {node: one.num_examples / total for node, one in zip(roster.partition_of, introductions, strict=True)}
     return roster, weights, normalisation.pool_stats([one.stats for one in introductions])
 
 
-def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:
+def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: messages.Rollouts) -> None:
     """Write a client's videos and log its rollouts."""
     folder = run.videos_dir(round_number, who)
     for name, content in rollouts.files.items():
         folder.mkdir(parents=True, exist_ok=True)
         files.write_atomically(folder / name, content)
-    measure.log_rollouts(
-        run, round_number, who, [{**row, "video": str(folder / row["video"])} for row in rollouts.rows]
-    )
+    rows = [{**row, "video": str(folder / row["video"])} for row in rollouts.rows]
+    measure.log_rollouts(run, round_number, who, rows)
 
 
 app = build()

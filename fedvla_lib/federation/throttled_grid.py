@@ -8,9 +8,9 @@ from flwr.app import Message
 from flwr.serverapp import Grid
 from flwr.superlink.grid import InMemoryGrid
 
-# The simulation runtime scans all messages that it holds for each client: n * n scans for n clients, which at 1,000
-# clients takes longer than the clients' work.
-MESSAGES_AT_ONCE = 16  # enough that every worker has its next one waiting
+# For each client the simulation runtime scans all messages that it holds: n * n for n clients, which with 1,000 clients
+# takes longer than their work.
+MESSAGES_AT_ONCE = 16  # enough to keep every worker of a machine busy
 PULL_INTERVAL_S = 0.1  # Flower's own
 
 

@@ -1,4 +1,4 @@
-"""Build the strategy that the settings name."""
+"""Choose the strategy by the settings."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ from fedvla_lib.federation.strategies.fedyogi import CheckedFedYogi
 from fedvla_lib.federation.strategies.krum import CheckedKrum
 from fedvla_lib.federation.strategies.scaffold import CheckedScaffold
 
-# What a strategy takes for the step size of the server, for arrays that start from a pretrained model. Flower's default
-# of 0.1 moves each weight by up to 0.1 a round, as far as these weights are from zero.
+# Default server learning rates, for pretrained weights. With Flower's 0.1 a round could change each weight by 0.1, which
+# is the size of the weights themselves.
 SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01}
 ADAPTIVITY = 1e-3  # tau: added to the root of the second moment
 
@@ -24,10 +24,10 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
 
     Args:
         weights: each node's share of all training frames.
-        **checked: what `Checked` takes beside the settings.
+        **checked: the other arguments of `Checked`.
     """
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
-    strategy, own = {
+    strategy, options = {
         "fedavg": (CheckedFedAvg, {}),
         "fedprox": (CheckedFedProx, {"proximal_mu": config.proximal_mu}),
         "fedavgm": (CheckedFedAvgM, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
@@ -37,4 +37,4 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
         "krum": (CheckedKrum, {"num_malicious_nodes": config.num_malicious}),
         "scaffold": (CheckedScaffold, {"weights": weights}),
     }[config.strategy]
-    return strategy(config=config, **own, **checked)
+    return strategy(config=config, **options, **checked)

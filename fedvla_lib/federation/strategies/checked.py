@@ -51,7 +51,7 @@ class Checked:
         **flower: passed on to the Flower strategy.
     """
 
-    _also: tuple[str, ...] = ()  # array records in a reply beside the trained arrays
+    _extra_records: tuple[str, ...] = ()  # records of arrays in a training reply beside the model's
     _persistent: tuple[str, ...] = ()  # attributes of the Flower strategy that persist between rounds
 
     def __init__(
@@ -68,7 +68,7 @@ class Checked:
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.config, self.roster, self.shapes = config, roster, shapes
         self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
-        self._asked: list[int] = []
+        self._sampled: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
 
@@ -98,28 +98,28 @@ class Checked:
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Aggregate the valid replies; raise TooFewReplies if there are fewer than `min_replies`."""
         server_round += self.rounds_done
-        good = self._valid(server_round, "train", replies, self._check_train)
-        if len(good) < self.config.min_replies:
+        valid = self._valid(server_round, "train", replies, self._check_train)
+        if len(valid) < self.config.min_replies:
             raise TooFewReplies(
-                f"round {server_round}: {len(good)} of {len(self._asked)} training replies are valid, "
+                f"round {server_round}: {len(valid)} of {len(self._sampled)} training replies are valid, "
                 f"min-replies={self.config.min_replies} are required; the rejected ones are in metrics.jsonl"
             )
-        for reply in good if self.config.exchange != "float32" else []:
+        for reply in valid if self.config.exchange != "float32" else []:
             self._restore(reply)
-        self._before_aggregation(server_round, good)
-        for reply in good if self.config.clip_norm else []:
+        self._before_aggregation(server_round, valid)
+        for reply in valid if self.config.clip_norm else []:
             self._clip(reply)
-        arrays, metrics = super().aggregate_train(server_round, good)
+        arrays, metrics = super().aggregate_train(server_round, valid)
         return _as_float32(arrays), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the valid replies of clients that have held-out episodes."""
         server_round += self.rounds_done
-        good = self._valid(server_round, "evaluate", replies, _check_evaluate)
-        for reply in good:
+        valid = self._valid(server_round, "evaluate", replies, _check_evaluate)
+        for reply in valid:
             name = self.roster.name(reply.metadata.src_node_id)
             self.keep_rollouts(server_round, name, messages.unpack_rollouts(reply.content))
-        measured = [reply for reply in good if _examples(reply) > 0]
+        measured = [reply for reply in valid if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
 
     def state(self) -> dict[str, Arrays]:
@@ -149,9 +149,8 @@ class Checked:
     def _restore(self, reply: Message) -> None:
         """Replace the encoded update in a reply by the arrays: global arrays plus update."""
         change = decode(messages.unpack_arrays(reply.content[messages.ARRAYS]), self.config.exchange)
-        reply.content[messages.ARRAYS] = messages.pack_arrays(
-            {name: self._global[name] + change[name] for name in change}
-        )
+        arrays = {name: self._global[name] + change[name] for name in change}
+        reply.content[messages.ARRAYS] = messages.pack_arrays(arrays)
 
     def _clip(self, reply: Message) -> None:
         """Scale a client's update down to the L2 norm `clip_norm`."""
@@ -163,10 +162,10 @@ class Checked:
             clipped = {name: self._global[name] + scale * array for name, array in update.items()}
             reply.content[messages.ARRAYS] = messages.pack_arrays(clipped)
 
-    def _before_aggregation(self, server_round: int, good: list[Message]) -> None:
+    def _before_aggregation(self, server_round: int, valid: list[Message]) -> None:
         """Report the client drift of the valid training replies, before they are aggregated."""
         name = self.roster.name
-        ends = {name(r.metadata.src_node_id): messages.unpack_arrays(r.content[messages.ARRAYS]) for r in good}
+        ends = {name(r.metadata.src_node_id): messages.unpack_arrays(r.content[messages.ARRAYS]) for r in valid}
         for who, values in geometry(self._global, ends).items():
             self.report(server_round, who, "drift", values)
 
@@ -177,8 +176,8 @@ class Checked:
 
     def _select(self, share: float, server_round: int, purpose: int) -> SampledNodes:
         rng = np.random.default_rng([self.config.seed, server_round, purpose])
-        self._asked = self.roster.sample(share, rng)
-        return SampledNodes(self._asked)
+        self._sampled = self.roster.sample(share, rng)
+        return SampledNodes(self._sampled)
 
     def _valid(
         self, server_round: int, kind: str, replies: Iterable[Message], check: Callable[[Message], None]
@@ -186,22 +185,22 @@ class Checked:
         """Return the valid replies in the order of partitions; report each reply and the counts."""
         by_node = {reply.metadata.src_node_id: reply for reply in replies}
         received = sum(messages.count_bytes(reply.content) for reply in by_node.values() if not reply.has_error())
-        good, rejected = [], []
-        for node in self._asked:  # ordered by partition
+        valid, rejected = [], []
+        for node in self._sampled:  # ordered by partition
             try:
                 check(answered(by_node.get(node)))
             except ParameterError as error:
                 rejected.append(error.kind)
                 self._reject(server_round, self.roster.name(node), kind, error)
             else:
-                good.append(by_node[node])
+                valid.append(by_node[node])
                 self.report(server_round, self.roster.name(node), kind, _values(by_node[node]))
         counts = {f"rejected_{reason}": rejected.count(reason) for reason in sorted(set(rejected))}
-        if self._asked:
-            counted = {"to": kind, "good": len(good), "rejected": len(rejected)}
+        if self._sampled:
+            counted = {"to": kind, "good": len(valid), "rejected": len(rejected)}
             counted |= {"sent_bytes": self._sent_bytes, "received_bytes": received}
             self.report(server_round, GLOBAL, "replies", counted | counts)
-        return good
+        return valid
 
     def _reject(self, server_round: int, name: str, kind: str, error: ParameterError) -> None:
         logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, error.kind, error)
@@ -216,12 +215,10 @@ class Checked:
             raise ParameterError("metrics", f"{messages.STEPS}={steps!r}: expected a whole number of steps, 1 or more")
         announced = self.roster.examples_of.get(reply.metadata.src_node_id, _examples(reply))
         if _examples(reply) != announced:  # its weight in the average must not change
-            raise ParameterError(
-                "examples", f"{messages.EXAMPLES}={_examples(reply)}, but it reported {announced} at first"
-            )
-        messages.checked_arrays(
-            reply.content, messages.NOTE, self.shapes, also=self._also, exchange=self.config.exchange
-        )
+            found = f"{messages.EXAMPLES}={_examples(reply)}"
+            raise ParameterError("examples", f"{found}, but the client first reported {announced}")
+        exchange, also = self.config.exchange, self._extra_records
+        messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=also, exchange=exchange)
 
 
 def _check_evaluate(reply: Message) -> None:
@@ -237,9 +234,8 @@ def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
     examples = _examples(reply)
     if not isinstance(examples, int) or examples < 0:
         raise ParameterError("examples", f"{messages.EXAMPLES}={examples!r}: expected a number of frames")
-    if (found := set(records[messages.METRICS])) != set(expected) and not (
-        found == {messages.EXAMPLES} and examples == 0
-    ):
+    found = set(records[messages.METRICS])
+    if found != set(expected) and not (found == {messages.EXAMPLES} and examples == 0):
         raise ParameterError("metrics", f"got {sorted(found)}, expected {sorted(expected)}")
     for key, value in records[messages.METRICS].items():
         if isinstance(value, list) or not math.isfinite(value):

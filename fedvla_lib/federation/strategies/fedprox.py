@@ -15,9 +15,8 @@ class Proximal:
     Li et al. 2020, Federated Optimization in Heterogeneous Networks, https://arxiv.org/abs/1812.06127.
 
     Args:
-        anchor: the parameters as the global model has them, by name. They are copied: an anchor that is the live
-            weights themselves moves along and pulls nowhere.
-        mu: weight of the term; with 0 nothing is added, which leaves FedAvg to the last bit.
+        anchor: the global model's parameters by name; they are copied, because the live parameters change in training.
+        mu: weight of the term; with 0 the result is that of FedAvg, bit for bit.
     """
 
     def __init__(self, anchor: Mapping[str, torch.Tensor], mu: float) -> None:

@@ -61,10 +61,10 @@ class CheckedScaffold(Checked, FedAvg):
 
     Args:
         weights: p_k by node id, for all clients, sampled or not.
-        **checked: what `Checked` takes.
+        **checked: arguments of `Checked`.
     """
 
-    _also = (messages.CONTROL,)
+    _extra_records = (messages.CONTROL,)
     _persistent = ("control",)
 
     def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
