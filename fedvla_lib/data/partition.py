@@ -1,4 +1,4 @@
-"""Partitioning: an episode table -> one list of episode ids per client, and the heterogeneity of the clients.
+"""Partitioning: an episode table -> one list of episode ids per client.
 
 Whole episodes are assigned, since neighbouring frames are nearly identical. Two schemes use flwr-datasets' partitioners
 with an episode as a row and its task as the label. This module does not know images or training.
