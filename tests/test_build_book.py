@@ -48,6 +48,7 @@ def project(tmp_path) -> Path:
 def test_key_changes_with_everything_a_chapter_depends_on(project):
     keys = {build_book.library_key(project, profile) for profile in ("tiny", "laptop")}
     for path, text in (("fedvla_lib/robot/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
+        (project / path).parent.mkdir(exist_ok=True)
         (project / path).write_text(text)
         keys.add(build_book.library_key(project, "tiny"))
     (project / "fedvla_lib" / "new.py").write_text("")
@@ -143,7 +144,7 @@ def test_failing_cell_names_chapter_and_error_and_leaves_no_copy(project, jobs):
 def test_chapters_whose_costs_are_printed_are_executed_one_at_a_time(capsys):
     with pytest.raises(SystemExit, match="2"):
         build_book.main(["--profile", "laptop", "--jobs", "2"])
-    assert "laptop is measured one at a time" in capsys.readouterr().err
+    assert "profile laptop are timed one at a time" in capsys.readouterr().err
 
 
 @pytest.mark.unit
@@ -216,27 +217,27 @@ def test_warnings_of_the_book_are_errors(project, capfd):
     (project / "book" / "index.md").write_text("# Front\n\nSee {doc}`nowhere`.\n")
     source = project / "_build" / "tiny" / "source"
     build_book.lay_out(project, source, [], "tiny")
-    with pytest.raises(BookError, match="built strictly"):
+    with pytest.raises(BookError, match="warnings above, which are errors"):
         build_book.render(source, project / "_build" / "tiny")
     assert "nowhere" in capfd.readouterr().err
 
 
-def film(number: int, ending: str) -> str:
+def figure(number: int, ending: str) -> str:
     return f'<figure><video aria-label="Round {number}. Lift the red cube. {ending}"></video></figure>'
 
 
 @pytest.mark.unit
-def test_the_front_page_shows_the_first_film_of_the_last_round(tmp_path):
-    html = "".join([film(0, "no"), film(10, "failed"), film(0, "no"), film(10, "worked")])
+def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
+    html = "".join([figure(0, "no"), figure(10, "failed"), figure(0, "no"), figure(10, "worked")])
     output = nbformat.v4.new_output("display_data", {"text/html": f"<div>{html}</div>"})
     cell = nbformat.v4.new_code_cell("show", outputs=[output])
-    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "films.ipynb")
-    said = build_book._film(tmp_path / "films.ipynb", "tiny")
-    assert said.startswith(film(10, "failed") + "\n\n") and "profile `tiny`" in said
-    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "films.ipynb")
-    with pytest.raises(BookError, match="films.ipynb shows no film"):
-        build_book._film(tmp_path / "films.ipynb", "tiny")
-    assert build_book.FILM in (ROOT / build_book.FRONT_PAGE).read_bytes()
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "videos.ipynb")
+    said = build_book._video(tmp_path / "videos.ipynb", "tiny")
+    assert said.startswith(figure(10, "failed") + "\n\n") and "profile `tiny`" in said
+    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "videos.ipynb")
+    with pytest.raises(BookError, match="videos.ipynb shows no video"):
+        build_book._video(tmp_path / "videos.ipynb", "tiny")
+    assert build_book.VIDEO in (ROOT / build_book.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
@@ -244,38 +245,38 @@ def test_the_front_page_says_what_the_stored_comparison_found():
     stored = results.read_results(ROOT / build_book.COMPARISON)
     rows = stored[(stored.partition == "task") & (stored.method == "fedavg-200x2x2")]
     said = build_book._headline(ROOT / build_book.COMPARISON)
-    assert f"the federated model succeeds in {100 * rows.success.mean():.1f} % [" in said
-    assert f"{len(rows):,} rollouts over {rows.run.nunique()} training seeds" in said
+    assert f"the success rate of the federated model is {100 * rows.success.mean():.1f} % [" in said
+    assert f"over {len(rows):,} rollouts and {rows.run.nunique()} training seeds" in said
     in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
-    assert f"After {in_all} gradient steps in all" in said and f"has walked {in_a_row} steps in a row" in said
+    assert f"After {in_all} gradient steps in total" in said and f"took {in_a_row} sequential steps" in said
     assert set(stored.partition) <= set(build_book.DEALT)
     gaps = tables.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
         words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
-        assert words in said.split("Federated minus pooled: ")[1].split("\n")[0]
+        assert words in said.split("Federated minus centralized: ")[1].split("\n")[0]
     assert said.count(" points [") == len(gaps) + 1  # and federated minus labs alone, at their own tasks
     assert build_book.HEADLINE in (ROOT / build_book.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
-def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_judged():
+def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_evaluated():
     stored = results.read_results(ROOT / build_book.COMPARISON)
     stored = stored[stored.partition == "task"]
     said = build_book._headline(ROOT / build_book.COMPARISON)
     share, longer = (stored[stored.method == method] for method in ("local-only", "local-only-800"))
     steps = {method: part.steps_in_all.unique().item() for method, part in (("share", share), ("longer", longer))}
-    assert f"only its share of the steps, {steps['share']}, succeeds in {100 * share.success.mean():.1f} % [" in said
-    assert "no measure of what a lab can do alone" in said and "is not answered by this grid" in said
+    assert f"alone for its share of the steps, {steps['share']}, reaches {100 * share.success.mean():.1f} % [" in said
+    assert "does not measure what a lab can do alone" in said and "This grid does not answer" in said
     own = longer[tables.at_own_task(longer)]
     federated = stored[(stored.method == "fedavg-200x2x2") & stored.run.isin(own.run)]
     same = federated.merge(own[["run", "task", "seed"]], on=["run", "task", "seed"])
     assert len(same) == len(own) and own.counted.all()
-    assert f"After {steps['longer']} steps each, labs alone succeed in {100 * own.success.mean():.1f} % [" in said
-    assert f"of {len(own)} rollouts at their own task" in said
+    assert f"After {steps['longer']} steps each, labs alone reach {100 * own.success.mean():.1f} % [" in said
+    assert f"over {len(own)} rollouts at their own task" in said
     gap = 100 * (same.success.mean() - own.success.mean())
     assert f"{100 * same.success.mean():.1f} % [" in said and f"federated minus alone, {gap:.1f} points [" in said
     assert "one training seed" in said, "of several seeds the sentence says how many"
-    assert "`local-only`" in said.split("The steps of ")[1].split(" follow from")[0], "steps that nobody counted"
+    assert "`local-only`" in said.split("The steps of ")[1].split(" are derived from")[0], "steps that nobody counted"
 
 
 @pytest.mark.unit
@@ -284,8 +285,8 @@ def test_the_front_page_draws_each_method_with_its_steps_and_labs_alone_by_whose
     draw = build_book.plots.success_intervals
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
     monkeypatch.setattr(build_book.plots, "success_intervals", keep)
-    picture = build_book._outcome(ROOT / build_book.COMPARISON)
-    assert picture.startswith(b"\x89PNG") and picture == build_book._outcome(ROOT / build_book.COMPARISON)
+    image = build_book._outcome(ROOT / build_book.COMPARISON)
+    assert image.startswith(b"\x89PNG") and image == build_book._outcome(ROOT / build_book.COMPARISON)
     rows = [label.get_text() for label in drawn[0].get_yticklabels()]
     assert {"local-only, own task, 80 steps", "local-only, other tasks, 80 steps", "centralized, 800 steps",
             "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(rows)  # fmt: skip
@@ -299,5 +300,5 @@ def test_the_front_page_is_not_built_over_methods_that_took_other_steps(monkeypa
         steps_in_all=rows.steps_in_all.where(rows.method != "centralized", rows.steps_in_all + 1)
     )
     monkeypatch.setattr(build_book.results, "read_results", longer)
-    with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in steps"):
+    with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in total steps"):
         build_book._headline(ROOT / build_book.COMPARISON)

@@ -13,12 +13,12 @@ PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>A pa
 <meta name="viewport" content="width=device-width"><link rel="icon" href="data:,"></head>
 <body><main><h1 id="top">A page</h1>{}</main></body></html>"""
 SOUND = """<p><a href="#top">To the top</a>, <a href="other.html#part">to a part</a></p>
-<img src="figure.png" alt="A line that falls from ten to one"><video src="film.mp4" controls></video>"""
+<img src="figure.png" alt="A line that falls from ten to one"><video src="video.mp4" controls></video>"""
 WRONG = {  # page -> its content, and what has to be said of it
-    "dead_link": ('<a href="gone.html">there</a>', "links to gone.html, which is not there"),
+    "dead_link": ('<a href="gone.html">there</a>', "links to gone.html, which does not exist"),
     "dead_anchor": ('<a href="other.html#gone">there</a>', "links to other.html#gone, which has no such anchor"),
-    "no_alt": ('<img src="figure.png">', "picture figure.png has the alt text ''"),
-    "no_picture": ('<img src="gone.png" alt="A line that falls to one">', "picture gone.png does not load"),
+    "no_alt": ('<img src="figure.png">', "image figure.png has the alt text ''"),
+    "no_image": ('<img src="gone.png" alt="A line that falls to one">', "image gone.png does not load"),
     "wide": ('<div style="width: 700px">wide</div>', "px wide on a screen of 360"),
     "console": ("<script>console.error('lost')</script>", "console: lost"),
     "script": ("<script>throw new Error('broken')</script>", "script: broken"),
@@ -38,7 +38,7 @@ def write_site(folder: Path, pages: dict[str, str]) -> Path:
     (folder / "sitemap.xml").write_text("<urlset/>")
     frames = np.zeros((8, 64, 64, 3), np.uint8)
     iio.imwrite(folder / "figure.png", frames[0])
-    iio.imwrite(folder / "film.mp4", frames, fps=8)
+    iio.imwrite(folder / "video.mp4", frames, fps=8)
     return folder
 
 
@@ -84,11 +84,11 @@ def test_files_beside_the_pages_are_required(tmp_path, name):
 @pytest.mark.parametrize("inside", [True, False])
 def test_a_heavy_video_is_found(tmp_path, inside):
     source = "data:video/mp4;base64," + "A" * check_site.VIDEO_BYTES if inside else "heavy.mp4"
-    content = f'<video src="film.mp4"></video><video controls><source src="{source}" type="video/mp4"></video>'
-    site = write_site(tmp_path, {"films": content})
+    content = f'<video src="video.mp4"></video><video controls><source src="{source}" type="video/mp4"></video>'
+    site = write_site(tmp_path, {"videos": content})
     (site / "heavy.mp4").write_bytes(bytes(check_site.VIDEO_BYTES + 1))
-    facts = {page: check_site.read(site, page) for page in ("films.html", "index.html")}
-    assert check_site.heavy_videos(site, "films.html", facts) == ["video 2 has 1.0 MB"]
+    facts = {page: check_site.read(site, page) for page in ("videos.html", "index.html")}
+    assert check_site.heavy_videos(site, "videos.html", facts) == ["video 2 has 1.0 MB"]
     assert not check_site.heavy_videos(site, "index.html", facts)
 
 

@@ -32,11 +32,11 @@ def test_chapters_are_listed_with_their_place(tmp_path):
     text = status.status(ROOT, [one, two], "tiny")
     when = where["started"][:16].replace("T", " ")
     assert f"| [](../notebooks/01_data.ipynb) | 12 | 7 | {when} |" in text
-    assert "| **together** | **15** |" in text and "| 2 | – | – |" in text and "chapters at a time" not in text
+    assert "| **total** | **15** |" in text and "| 2 | – | – |" in text and "chapters in parallel" not in text
     assert f"torch {where['versions']['torch']}" in text and f"{where['hardware']['cores']} cores" in text
     assert platform.node() not in json.dumps(where), "no host names"
     shared = chapter(tmp_path, "03_local_training", seconds=30.0, at_a_time=2)
-    assert "Profile `tiny`, 2 chapters at a time" in status.status(ROOT, [one, shared], "tiny")
+    assert "Profile `tiny`, 2 chapters in parallel" in status.status(ROOT, [one, shared], "tiny")
 
 
 def test_reports_of_the_tests_are_shown_where_they_are(tmp_path):

@@ -2,10 +2,10 @@
 
     python book/tools/build_book.py --profile laptop
 
-Jupyter Book's own execution cache looks at a notebook's cells only: after a change of the library it would show old
-results. Here a chapter is executed again exactly when its key changes; the key covers notebook, library, lock and
-profile. papermill executes it with the profile as an injected parameter; the executed copies and the pages go to
-`_build/<profile>/source`, and Jupyter Book builds them from there: execution off, warnings as errors.
+Jupyter Book's execution cache ignores changes of the library. Here a chapter is executed again if its key changes,
+which covers notebook, library, requirements.lock and profile. papermill executes it with the profile as parameter; the
+executed copies and the pages go to `_build/<profile>/source`, which Jupyter Book renders: execution off, warnings as
+errors.
 """
 
 import argparse
@@ -36,35 +36,31 @@ from papermill.exceptions import PapermillExecutionError
 import library
 import status
 from fedvla_book import plots, tables
-from fedvla_lib.evaluation import statistics
+from fedvla_lib.evaluation import figures, statistics
 from fedvla_lib.experiments import results
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
 STATUS_PAGE = "book/run_times.md"
-STATUS = b"<!-- status -->"  # there: what this build is made of takes this line's place
-MODEL_CARD = "book/nano_base.md"  # the page that ends with what was measured of the nano base
+STATUS = b"<!-- status -->"  # replaced by the status of the build
+MODEL_CARD = "book/nano_base.md"  # ends with generated results of the nano base
 FRONT_PAGE = "book/index.md"
-HEADLINE = b"<!-- headline -->"  # on the front page: what the comparison found takes this line's place
+HEADLINE = b"<!-- headline -->"  # on the front page: replaced by the result of the comparison
 ARCHITECTURE, MODULES, IMPORTS = "book/architecture.md", b"<!-- modules -->", "book/_static/imports.svg"
 FUNCTIONS_PAGE, FUNCTIONS = "book/library.md", b"<!-- functions -->"
-FILM = b"<!-- film -->"  # on the front page: the federated policy in this build
-FILMED_IN = "05_evaluation_videos"
+VIDEO = b"<!-- video -->"  # on the front page: replaced by a video of this build's federated policy
+VIDEO_CHAPTER = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
-OUTCOME = "book/_static/outcome.png"  # the figure of it
-FEDERATED, POOLED, ALONE, LONGER = (
-    "fedavg-200x2x2",
-    "centralized",
-    "local-only",
-    "local-only-800",
-)  # methods it tells of
-NEARLY_SOLVED = 0.8  # success of labs alone above which their tasks leave little for a federation to add
+OUTCOME = "book/_static/outcome.png"  # its figure
+# Methods in the headline.
+FEDERATED, POOLED, LOCAL, LOCAL_LONGER = "fedavg-200x2x2", "centralized", "local-only", "local-only-800"
+NEARLY_SOLVED = 0.8  # success rate of local-only labs above which federating can add little
 DEALT = {"iid": "the same mix of tasks in every lab", "dirichlet-0_5": "uneven mixes (Dirichlet, 0.5)",
-         "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task a lab",
+         "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task per lab",
          "lab": "labs that differ in camera, light and calibration"}  # fmt: skip
 ACCOUNT = "fedvla_lib/nano_base/pretraining.json"
-TOLD = {"right": "this cube's colour", "other": "the other cube's colour"}
-# Pages that end with results of benchmarks that were kept.
+INSTRUCTION = {"right": "this cube's colour", "other": "the other cube's colour"}
+# Pages that end with stored results of benchmarks.
 RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
     "book/reference_runs.md": ["four_methods"],
@@ -74,24 +70,24 @@ RESULTS_ON = {
     "book/scale.md": ["scale"],
 }  # fmt: skip
 TITLES = {
-    "fine_tuning": "what it is worth: each task learned alone from the base, on one core",
+    "fine_tuning": "fine-tuning: each task alone from the base, on one core",
     "floor": "the floor",
-    "four_methods": "one federation after another, its clients alone with their share of the steps, and centralized",
+    "four_methods": "base, federated, local-only with its share of the steps, and centralized",
 }
 PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 BENCHMARKS = "benchmarks/results"
-REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results, as chapters name it
-BUILT_FROM = ".built-from"  # beside the pages: the digest of what they were built from
+REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
+BUILT_FROM = ".built-from"  # file next to the pages with the digest of their sources
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
 
 class BookError(ValueError):
-    """The book cannot be built; the message is one line that names the chapter or page."""
+    """The book cannot be built; the message is one line and names the chapter or page."""
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """One executed notebook: where it is, what it was made from and what it cost."""
+    """One executed notebook: its file, key and execution time."""
 
     name: str
     executed: Path
@@ -101,14 +97,14 @@ class Chapter:
 
 
 def library_key(root: Path, profile: str) -> str:
-    """Return a digest of everything but the notebook that a chapter's results depend on."""
+    """Return a digest of all that a chapter's results depend on, except the notebook."""
     packages = [path for name in PACKAGES for path in (root / name).rglob("*") if "__pycache__" not in path.parts]
     files = [*sorted(packages), root / "requirements.lock"]
     return _digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
 
 
 def notebook_key(notebook: Path, library: str) -> str:
-    """Return the digest that decides whether `notebook` has to be executed again: it, the library, what it reads."""
+    """Return the digest of `notebook`, the library and the stored results that it reads."""
     source = notebook.read_bytes()
     folders = sorted({notebook.parent / name.decode() for name in REFERENCE.findall(source)})
     files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
@@ -121,10 +117,10 @@ def _named_bytes(root: Path, path: Path) -> bytes:
 
 
 def _digest(parts: Iterable[bytes]) -> str:
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for part in parts:
-        whole.update(hashlib.sha256(part).digest())  # fixed length each, so that no two lists collide
-    return whole.hexdigest()
+        digest.update(hashlib.sha256(part).digest())  # of fixed length, so that no two lists collide
+    return digest.hexdigest()
 
 
 def toc_pages(root: Path) -> list[str]:
@@ -143,7 +139,7 @@ def _files_under(node: object) -> list[str]:
 
 
 def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
-    """Raise BookError unless the parameters cell of `notebook` has every parameter; papermill itself only warns."""
+    """Raise BookError if the parameters cell of `notebook` lacks a parameter; papermill only warns."""
     known = papermill.inspect_notebook(str(notebook))
     for name in parameters:
         if name not in known:
@@ -151,7 +147,7 @@ def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
 
 
 def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
-    """Return the executed copy of `notebook` in `folder` if nothing it depends on has changed since, else None."""
+    """Return the executed copy of `notebook` in `folder` if its key is unchanged, else None."""
     target, key = folder / notebook.name, notebook_key(notebook, library)
     if not target.is_file() or (stamp := _stamp(target)).get("key") != key:
         return None
@@ -159,10 +155,10 @@ def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
 
 
 def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time: int = 1) -> Chapter:
-    """Execute `notebook` at `profile` and put the copy with its results into `folder`.
+    """Execute `notebook` with `profile` and write the executed copy to `folder`.
 
     Args:
-        at_a_time: how many chapters are executed side by side, for the status page.
+        at_a_time: number of chapters executed in parallel, for the status page.
 
     Raises:
         BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
@@ -170,10 +166,10 @@ def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time:
     target, key = folder / notebook.name, notebook_key(notebook, library)
     parameters = {"profile": profile}
     check_parameters(notebook, parameters)
-    where = status.environment(notebook, profile)
+    environment = status.environment(notebook, profile)
     seconds = _execute(notebook, target, parameters)
     cost = {"seconds": round(seconds, 1), "at_a_time": at_a_time}
-    _finish(target, {"key": key, "profile": profile, **cost, "environment": where})
+    _finish(target, {"key": key, "profile": profile, **cost, "environment": environment})
     return Chapter(notebook.stem, target, key, seconds, reused=False)
 
 
@@ -182,7 +178,7 @@ def _stamp(executed: Path) -> dict:
 
 
 def _execute(notebook: Path, target: Path, parameters: dict[str, object]) -> float:
-    """Run `notebook` in its own folder, as nbmake and a reader do; return the wall time in seconds."""
+    """Run `notebook` in its folder, as nbmake and readers do; return the wall time in seconds."""
     start = time.monotonic()
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
@@ -195,11 +191,11 @@ def _execute(notebook: Path, target: Path, parameters: dict[str, object]) -> flo
             kernel_name="python3",
             progress_bar=sys.stderr.isatty(),
             execution_timeout=CELL_TIMEOUT_S[str(parameters["profile"])],
-            extra_arguments=["--log-level=CRITICAL"],  # kernels talk about their sockets; cells still show errors
+            extra_arguments=["--log-level=CRITICAL"],  # silences log messages of kernels; cells still show errors
         )
     except PapermillExecutionError as error:
-        where = os.path.relpath(_unfinished(target))
-        raise BookError(f"{notebook.name}: {error.ename}: {error.evalue.strip()} (see {where})") from error
+        copy = os.path.relpath(_unfinished(target))
+        raise BookError(f"{notebook.name}: {error.ename}: {error.evalue.strip()} (see {copy})") from error
     return time.monotonic() - start
 
 
@@ -208,7 +204,7 @@ def _unfinished(target: Path) -> Path:
 
 
 def _finish(target: Path, stamp: dict[str, object]) -> None:
-    """Turn papermill's output into the copy that is rendered, without its injected cell and this machine's paths."""
+    """Turn papermill's output into the rendered copy, without the injected cell and local paths."""
     notebook = nbformat.read(_unfinished(target), as_version=4)
     notebook.cells = [cell for cell in notebook.cells if "injected-parameters" not in cell.metadata.get("tags", [])]
     notebook.metadata.pop("papermill", None)
@@ -222,11 +218,11 @@ def _finish(target: Path, stamp: dict[str, object]) -> None:
 def execute_chapters(
     root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None, jobs: int = 1
 ) -> list[Chapter]:
-    """Execute the chapters of the contents whose name contains `only` and that changed, saying what each costs.
+    """Execute the changed chapters of the table of contents whose name contains `only`, and print their times.
 
     Args:
-        prepare: called with the profile before the first chapter that has to be executed.
-        jobs: how many are executed at a time; each takes longer then than alone.
+        prepare: called with the profile if any chapter has to be executed, before the first.
+        jobs: number of chapters executed in parallel; each then takes longer than alone.
     """
     library, folder = library_key(root, profile), root / "_build" / profile / "executed"
     notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file() and only in page]
@@ -236,32 +232,32 @@ def execute_chapters(
     if not all(chapters.values()):
         prepare(profile)
     place = {path: f"[{number}/{len(notebooks)}] {path.stem}" for number, path in enumerate(notebooks, start=1)}
-    order = notebooks if jobs == 1 else notebooks[::-1]  # the last are the longest: none is left when others are done
-    with _workers(jobs) as give:
+    order = notebooks if jobs == 1 else notebooks[::-1]  # the last chapters take longest, so start them first
+    with _workers(jobs) as submit:
         changed = [path for path in order if chapters[path] is None]
-        said = {path: f"{place[path]}, profile {profile} ..." for path in changed}
-        work = {path: give(_announced, said[path], path, folder, profile, library, jobs) for path in changed}
+        lines = {path: f"{place[path]}, profile {profile} ..." for path in changed}
+        work = {path: submit(_announced, lines[path], path, folder, profile, library, jobs) for path in changed}
         for path in order:
             chapters[path] = chapters[path] or work[path]()
             print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
 
 
-def _announced(words: str, notebook: Path, *how: Any) -> Chapter:
-    print(words, flush=True)
-    return execute(notebook, *how)
+def _announced(line: str, notebook: Path, *options: Any) -> Chapter:
+    print(line, flush=True)
+    return execute(notebook, *options)
 
 
 def _on_one_thread() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the kernels that this process will start
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # inherited by the kernels
 
 
 @contextmanager
 def _workers(jobs: int) -> Iterator[Callable[..., Callable[[], Chapter]]]:
-    """Yield a function that takes work and returns what to call for its result.
+    """Yield a function that submits work and returns a function for its result.
 
-    One at a time, the work is done here, when its result is asked for. Otherwise it begins at once, in other processes:
-    papermill works in the folder of the notebook, which threads could not do side by side.
+    With one job the work runs here when its result is requested. Otherwise it starts at once in other processes:
+    papermill changes the working directory, which threads share.
     """
     if jobs == 1:
         yield partial
@@ -274,7 +270,7 @@ def _workers(jobs: int) -> Iterator[Callable[..., Callable[[], Chapter]]]:
 
 
 def record_data(profile: str) -> None:
-    """Record the demonstrations that the chapters share, so that no chapter's time contains it."""
+    """Record the demonstrations that the chapters share, so that it does not count in a chapter's time."""
     command = [sys.executable, "-m", "fedvla_lib.cli", "record", "--profile", profile]
     if subprocess.run(command, check=False).returncode:
         raise BookError("the demonstrations could not be recorded")
@@ -285,9 +281,9 @@ def _cost(chapter: Chapter) -> str:
 
 
 def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> str:
-    """Lay pages, executed chapters and configuration into `source` and return a digest of it all.
+    """Write pages, executed chapters and configuration to `source` and return a digest of all.
 
-    Unchanged files keep their time stamp, so that Sphinx reads and writes only the pages that differ.
+    Unchanged files keep their time stamp, so that Sphinx rebuilds only the pages that differ.
     """
     wanted = {Path("_toc.yml"): (root / "_toc.yml").read_bytes(), Path("_config.yml"): _rendering_config(root)}
     pages = [path for path in (root / "book").rglob("*") if path.suffix in PAGE_SUFFIXES]
@@ -295,7 +291,7 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     wanted |= {Path("notebooks") / chapter.executed.name: chapter.executed.read_bytes() for chapter in chapters}
     executed = {chapter.name: chapter.executed for chapter in chapters}
     _put(wanted, STATUS_PAGE, STATUS, lambda: status.status(root, executed.values(), profile))
-    _put(wanted, FRONT_PAGE, FILM, lambda: _film(executed[FILMED_IN], profile))
+    _put(wanted, FRONT_PAGE, VIDEO, lambda: _video(executed[VIDEO_CHAPTER], profile))
     if HEADLINE in wanted.get(Path(FRONT_PAGE), b""):
         wanted[Path(OUTCOME)] = _outcome(root / COMPARISON)
     _put(wanted, FRONT_PAGE, HEADLINE, lambda: _headline(root / COMPARISON))
@@ -314,13 +310,13 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
 
 
 def _put(wanted: dict[Path, bytes], page: str, mark: bytes, text: Callable[[], str]) -> None:
-    """Put generated text in the place of a page's mark, if the page has it."""
+    """Replace a page's mark by generated text, if the page has it."""
     if mark in wanted.get(Path(page), b""):
         wanted[Path(page)] = wanted[Path(page)].replace(mark, text().encode())
 
 
 def _library_pages(root: Path, wanted: dict[Path, bytes], chapters: Iterable[Path]) -> dict[Path, bytes]:
-    """Fill the pages about the library and return the picture of its imports."""
+    """Fill the pages about the library and return the figure of its imports."""
     if Path(ARCHITECTURE) not in wanted:
         return {}
     trees, used = library.modules(root), library.used_in(chapters)
@@ -330,7 +326,7 @@ def _library_pages(root: Path, wanted: dict[Path, bytes], chapters: Iterable[Pat
 
 
 def _rendering_config(root: Path) -> bytes:
-    """Return the book's configuration with execution off: the chapters it renders are executed already."""
+    """Return the book's configuration with execution off, since its chapters are already executed."""
     config = yaml.safe_load((root / "_config.yml").read_text(encoding="utf-8"))
     config["execute"] |= {"execute_notebooks": "off"}
     if config.get("repository", {}).get("url"):
@@ -347,14 +343,14 @@ def _write_if_changed(path: Path, content: bytes) -> None:
     os.replace(unfinished, path)
 
 
-def _film(chapter: Path, profile: str) -> str:
-    """The federated policy's first rollout of the last evaluated round, as a chapter shows it, whatever came of it."""
+def _video(chapter: Path, profile: str) -> str:
+    """The first video of the last evaluated round in a chapter, success or failure."""
     outputs = [output for cell in nbformat.read(chapter, as_version=4).cells for output in cell.get("outputs", [])]
     pages = [output.get("data", {}).get("text/html", "") for output in outputs]
-    films = [film for page in pages for film in re.findall(r"<figure.*?</figure>", page, flags=re.DOTALL)]
-    by_round = {film: int(told[1]) for film in films if (told := re.search(r'aria-label="Round (\d+)\.', film))}
+    figures = [figure for page in pages for figure in re.findall(r"<figure.*?</figure>", page, flags=re.DOTALL)]
+    by_round = {one: int(label[1]) for one in figures if (label := re.search(r'aria-label="Round (\d+)\.', one))}
     if not by_round:
-        raise BookError(f"{chapter.name} shows no film of a round, which the front page needs")
+        raise BookError(f"{chapter.name} shows no video of a round, which the front page needs")
     return (
         f"{max(by_round, key=by_round.get)}\n\nThe federated policy in this build, profile `{profile}`: overhead "
         "camera left, front camera right. {doc}`/notebooks/05_evaluation_videos` shows the others, failures included."
@@ -362,18 +358,18 @@ def _film(chapter: Path, profile: str) -> str:
 
 
 def _headline(comparison: Path) -> str:
-    """What the stored comparison says, one sentence a line, and a figure of it, for the front page.
+    """The result of the stored comparison for the front page: one sentence per line, and a figure.
 
     Raises:
-        BookError: federated and pooled training differ in their steps in all, so that the first sentence is wrong.
+        BookError: federated and centralized training differ in total steps, which makes the first sentence wrong.
     """
     rows = tables.repeat_partition_free(results.read_results(comparison))
     of_task = rows[rows.partition == "task"]
     of_method = results.summary(of_task).set_index("method")
     labs, tasks = of_task.client.nunique(), of_task.task.nunique()
     return "\n".join([
-        f"**What comes out.** Each of {labs} labs holds demonstrations of one of {tasks} tasks.",
-        *_at_equal_total(of_method), _gaps(rows), *_with_its_share(of_method), *_with_steps_of_its_own(of_task),
+        f"**Result.** Each of {labs} labs holds demonstrations of one of {tasks} tasks.",
+        *_at_equal_total(of_method), _gaps(rows), *_local_share(of_method), *_local_longer(of_task),
         _counting(of_method), "", _outcome_figure(of_method),
     ])  # fmt: skip
 
@@ -381,80 +377,81 @@ def _headline(comparison: Path) -> str:
 def _at_equal_total(of_method: pd.DataFrame) -> list[str]:
     federated, pooled = of_method.loc[FEDERATED], of_method.loc[POOLED]
     if federated.steps_in_all != pooled.steps_in_all or federated.rollouts != pooled.rollouts:
-        raise BookError(f"{FEDERATED} and {POOLED} differ in steps in all or in rollouts: the front page says equal")
+        raise BookError(f"{FEDERATED} and {POOLED} differ in total steps or rollouts, and the front page says equal")
     return [
-        f"After {federated.steps_in_all:,.0f} gradient steps in all, the federated model succeeds in "
-        f"{_rate_of(federated)} of rollouts, and training on all demonstrations in one place in {_rate_of(pooled)}, "
-        f"each in {federated.rollouts:,} rollouts over {federated.seeds} training seeds.",
-        f"The labs of a round train side by side, so the federated model has walked {federated.steps_in_a_row:,.0f} "
-        f"steps in a row, the pooled one {pooled.steps_in_a_row:,.0f}.",
+        f"After {federated.steps_in_all:,.0f} gradient steps in total, the success rate of the federated model is "
+        f"{_rate_of(federated)} and that of centralized training on all demonstrations {_rate_of(pooled)}, "
+        f"each over {federated.rollouts:,} rollouts and {federated.seeds} training seeds.",
+        f"The labs of a round train in parallel, so the federated model took {federated.steps_in_a_row:,.0f} "
+        f"sequential steps, the centralized one {pooled.steps_in_a_row:,.0f}.",
     ]
 
 
 def _gaps(rows: pd.DataFrame) -> str:
     found = tables.differences(rows, [(FEDERATED, POOLED)], seed=0).set_index("partition")
     gaps = [_gap(words, found.loc[name]) for name, words in DEALT.items() if name in found.index]
-    return f"Federated minus pooled: {'; '.join(gaps)}."
+    return f"Federated minus centralized: {'; '.join(gaps)}."
 
 
-def _with_its_share(of_method: pd.DataFrame) -> list[str]:
-    alone = of_method.loc[ALONE]
+def _local_share(of_method: pd.DataFrame) -> list[str]:
+    local = of_method.loc[LOCAL]
     return [
-        f"A lab alone with only its share of the steps, {alone.steps_in_all:,.0f}, succeeds in {_rate_of(alone)} of "
-        f"{alone.rollouts:,} rollouts over {alone.seeds} training seeds.",
-        "It was judged on all tasks, most of which it never saw: this number is no measure of what a lab can do alone.",
+        f"A lab that trains alone for its share of the steps, {local.steps_in_all:,.0f}, reaches {_rate_of(local)} "
+        f"over {local.rollouts:,} rollouts and {local.seeds} training seeds.",
+        "It was evaluated on all tasks, most of which it has no demonstrations of: "
+        "this number does not measure what a lab can do alone.",
     ]
 
 
-def _with_steps_of_its_own(of_task: pd.DataFrame) -> list[str]:
-    """Labs alone after as many steps as the federation, at their own task, and the federated model beside them."""
-    longer = of_task[of_task.method == LONGER]
+def _local_longer(of_task: pd.DataFrame) -> list[str]:
+    """Labs alone with as many steps as the federation, at their own task, next to the federated model."""
+    longer = of_task[of_task.method == LOCAL_LONGER]
     steps, elsewhere = longer.steps_in_all.mean(), longer[~tables.at_own_task(longer)]
-    found = tables.beside_own_tasks(of_task, LONGER, FEDERATED, seed=0)
+    found = tables.beside_own_tasks(of_task, LOCAL_LONGER, FEDERATED, seed=0)
     rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
     gap = _points(*(-100 * found[end] for end in ("difference", "high", "low")), " points")
     others = _percent(elsewhere.success.mean(), *statistics.success_interval(elsewhere))
-    once = "That is one training seed, so these intervals are for other rollouts, not for other trainings."
+    once = "That is one training seed, so these intervals cover other rollouts, not other training seeds."
     easy = found["success_rate"] > NEARLY_SOLVED
-    why = "few demonstrations nearly solve these tasks" if easy else "one lab holds few demonstrations of few tasks"
+    why = "few demonstrations nearly solve these tasks" if easy else "one lab has few demonstrations of few tasks"
     return [
-        f"After {steps:,.0f} steps each, labs alone succeed in {rates[0]} of {found['n']:,} rollouts at their own "
-        f"task, and the federated model in {rates[1]} of the same rollouts: federated minus alone, {gap}.",
-        f"At the other labs' tasks labs alone succeed in {others} of {len(elsewhere):,} rollouts; "
+        f"After {steps:,.0f} steps each, labs alone reach {rates[0]} over {found['n']:,} rollouts at their own "
+        f"task, and the federated model {rates[1]} over the same rollouts: federated minus alone, {gap}.",
+        f"At the other labs' tasks labs alone reach {others} over {len(elsewhere):,} rollouts; "
         "the federated model is one model for all tasks.",
         once if found["seeds"] == 1 else f"These are {found['seeds']} training seeds.",
-        f"Whether federating is worth it is not answered by this grid: {why}.",
+        f"This grid does not answer whether federating is worth it: {why}.",
     ]
 
 
 def _counting(of_method: pd.DataFrame) -> str:
-    told = "Brackets are 95 % intervals, and {doc}`/notebooks/06_federated_vs_centralized` says how they were made."
+    text = "Brackets are 95 % intervals; {doc}`/notebooks/06_federated_vs_centralized` explains them."
     planned = [f"`{method}`" for method, counted in of_method.counted.items() if not counted]
     if not planned:
-        return told
-    return f"{told}\nThe steps of {', '.join(planned)} follow from their settings: those runs are older than counting."
+        return text
+    return f"{text}\nThe steps of {', '.join(planned)} are derived from settings: those runs did not count their steps."
 
 
 def _outcome_figure(of_method: pd.DataFrame) -> str:
     few = [f"`{method}`" for method, seeds in of_method.seeds.items() if seeds == 1]
-    once = f" Of one training seed, with intervals for other rollouts only: {', '.join(few)}." if few else ""
+    once = f" With one training seed, hence intervals over rollouts only: {', '.join(few)}." if few else ""
     return (
         f"```{{figure}} {Path(OUTCOME).relative_to('book').as_posix()}\n"
-        ":alt: Points with intervals, one row a method with the gradient steps of its model: success rates of the base, "
-        "of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
+        ":alt: Points with intervals, a row per method with the gradient steps of its model: success rates of the "
+        "base, of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
         ":width: 100%\n\n"
-        "Success of each method with one task a lab, and the gradient steps of one model of it. Of labs alone, rollouts "
-        f"at their own task and at other tasks stand apart.{once}\n```"
+        "Success rate of each method with one task per lab, and the gradient steps of one model. For labs alone, "
+        f"rollouts at their own task and at other tasks are shown separately.{once}\n```"
     )
 
 
 def _outcome(comparison: Path) -> bytes:
-    """The figure under the front page's sentences, as PNG."""
+    """The figure below the headline, as PNG."""
     rows = tables.repeat_partition_free(results.read_results(comparison))
     plots.use_style()
     axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="method")
     with tempfile.TemporaryDirectory() as folder:
-        plots.save(axes, Path(folder) / "outcome.png")
+        figures.save(axes, Path(folder) / "outcome.png")
         return (Path(folder) / "outcome.png").read_bytes()
 
 
@@ -476,49 +473,49 @@ def _points(value: float, low: float, high: float, unit: str) -> str:
 
 
 def _card_tables(account: dict) -> str:
-    """What was measured of the nano base, as the end of its page."""
+    """Results of pretraining the nano base, for the end of its page."""
     recipe, stamp = account["recipe"], account["stamp"]
     seen = account["grounding"]
     batch, cores = recipe["batch_size"], "one core" if recipe["num_threads"] == 1 else f"{recipe['num_threads']} cores"
     facts = {
         "parameters": f"{account['parameters']:,}",
-        "scenes for learning to see": f"{recipe['scenes']:,}",
-        "steps of the vision-language part": f"{recipe['grounding_steps']:,} of {batch} scenes",
-        "time to learn to see": f"{seen['seconds'] / 60:.0f} minutes on {cores}",
+        "grounding scenes": f"{recipe['scenes']:,}",
+        "grounding steps (vision-language part)": f"{recipe['grounding_steps']:,} of {batch} scenes",
+        "grounding time": f"{seen['seconds'] / 60:.0f} minutes on {cores}",
         "pointing, median error": f"{1000 * seen['median_error_m']:.0f} mm",
         "pointing, 90 % within": f"{1000 * seen['p90_error_m']:.0f} mm",
         "demonstrations": f"{account['episodes']:,} ({account['frames']:,} frames)",
         "steps of the action expert": f"{recipe['steps']:,} of {batch} samples",
-        "time to learn to act": f"{account['training_seconds'] / 60:.0f} minutes on {cores}",
+        "training time of the action expert": f"{account['training_seconds'] / 60:.0f} minutes on {cores}",
         "mean loss of the last 100 steps": f"{account['last_loss']:.3f}",
         "seed": str(recipe["seed"]),
         "made": f"{stamp['started'][:10]}, torch {stamp['versions']['torch']}, lerobot {stamp['versions']['lerobot']}",
     }
-    made = status.table(["what", "measured"], [[name, value] for name, value in facts.items()])
+    made = status.table(["quantity", "value"], [[name, value] for name, value in facts.items()])
     rates = [_rate(row, "task") for row in account["success"]]
     success = status.table(["task", "successes", "rate", "95 % interval"], rates)
-    told = status.table(
-        ["task", "told", "successes", "rate", "95 % interval"],
-        [[row["task"], TOLD[row["told"]], *_rate(row, "task")[1:]] for row in account["language"]],
+    language = status.table(
+        ["task", "instruction names", "successes", "rate", "95 % interval"],
+        [[row["task"], INSTRUCTION[row["told"]], *_rate(row, "task")[1:]] for row in account["language"]],
     )
     return (
-        f"## The account\n\n{made}\n## Success\n\nIn the reference laboratory, on seeds that no demonstration has. "
-        "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, never seen, "
-        f"so this is what the base can do before any lab has trained.\n\n{success}\n## Does the sentence decide?\n\n"
-        "Two cubes of different colours stand on the table. Success is counted for one of them, while the method is told "
-        f"its colour or the other one's.\n\n{told}\n"
+        f"## Pretraining\n\n{made}\n## Success\n\nIn the reference lab, on seeds that no demonstration has. "
+        "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, without demonstrations, "
+        f"so this is the base before any lab has trained.\n\n{success}\n## Does it follow instructions?\n\n"
+        "Two cubes of different colours are on the table. Success is counted for one of them; the instruction names "
+        f"its colour or the other one's.\n\n{language}\n"
     )
 
 
 def _benchmark_tables(files: list[Path]) -> str:
-    """The results of benchmarks that were kept, one section each."""
+    """Stored results of benchmarks, a section each."""
     parts = []
     for path in filter(Path.is_file, files):
         result = json.loads(path.read_text(encoding="utf-8"))
         rows = [[_number(value) for value in row.values()] for row in result["rows"]]
         title = TITLES.get(path.stem, path.stem.replace("_", " "))
-        where = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
-        parts.append(f"## {title[0].upper()}{title[1:]}\n\n{where}\n\n{status.table(list(result['rows'][0]), rows)}")
+        machine = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
+        parts.append(f"## {title[0].upper()}{title[1:]}\n\n{machine}\n\n{status.table(list(result['rows'][0]), rows)}")
     return "\n".join(parts)
 
 
@@ -536,11 +533,11 @@ def _rate(row: dict, name: str) -> list[str]:
 
 
 def render(source: Path, output: Path) -> Path:
-    """Build the HTML book strictly and return the folder of its pages."""
-    # In a process of its own: Sphinx patches docutils globally and changes sys.path.
+    """Build the HTML book with warnings as errors and return the folder of its pages."""
+    # In a subprocess: Sphinx patches docutils globally and changes sys.path.
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
     options = ["-W", "-n", "--keep-going", "--quiet"]
-    # Where site_scripts.py lies, and the library whose functions are described.
+    # For site_scripts.py and the documented packages.
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")]),
@@ -548,12 +545,12 @@ def render(source: Path, output: Path) -> Path:
     # Warnings are on stderr.
     built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
     if built.returncode:
-        raise BookError("jupyter-book reported the warnings above; the book is built strictly, so they are errors")
+        raise BookError("jupyter-book reported the warnings above, which are errors")
     return output / "_build" / "html"
 
 
 def check_pages(root: Path, html: Path) -> int:
-    """Return the number of pages, after checking that each page of the contents is there and each image is described.
+    """Check that each page of the contents exists and each image has alternative text; return the number of pages.
 
     Raises:
         BookError: a page is missing, or an image has no alternative text; the message names them.
@@ -569,14 +566,14 @@ def check_pages(root: Path, html: Path) -> int:
 
 
 def _undescribed_images(page: Path) -> int:
-    """Count the images whose alternative text is missing or, as by default, the path of the image."""
+    """Count the images whose alternative text is missing or, the default, the path of the image."""
     images = re.findall(r"<img\b[^>]*>", page.read_text(encoding="utf-8"))
     texts = [re.search(r'\balt="([^"]*)"', image) for image in images]
     return sum(text is None or not text[1] or "_images/" in text[1] for text in texts)
 
 
 def build(root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1) -> Path | None:
-    """Execute what changed and, unless `execute_only`, build the book; return its front page."""
+    """Execute changed chapters and, unless `execute_only`, build the book; return its front page."""
     start = time.monotonic()
     chapters = execute_chapters(root, profile, only, prepare=record_data, jobs=jobs)
     if execute_only:
@@ -600,7 +597,7 @@ def is_published(target: Path, digest: str) -> bool:
 
 
 def publish(html: Path, target: Path, digest: str) -> None:
-    """Put the finished pages at `target` in one step: a build that fails leaves the last good book in place."""
+    """Replace the pages at `target` in one step, so that a failed build keeps the last good book."""
     target.parent.mkdir(parents=True, exist_ok=True)
     fresh, old = target.with_name(target.name + ".new"), target.with_name(target.name + ".old")
     shutil.rmtree(fresh, ignore_errors=True)
@@ -614,15 +611,17 @@ def publish(html: Path, target: Path, digest: str) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; bad input and a failing chapter are one line on stderr and exit status 2."""
+    """Run the command; errors are one line on stderr and exit status 2."""
     parser = argparse.ArgumentParser(description="Execute the chapters that changed and build the HTML book.")
     parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
-    parser.add_argument("--jobs", default=1, type=int, metavar="N", help="chapters at a time; above 1 only at tiny")
+    parser.add_argument(
+        "--jobs", default=1, type=int, metavar="N", help="chapters in parallel; above 1 only with profile tiny"
+    )
     options = parser.parse_args(argv)
     if options.jobs < 1 or (options.jobs > 1 and options.profile != "tiny"):
-        parser.error(f"--jobs {options.jobs}: what a chapter costs at {options.profile} is measured one at a time")
+        parser.error(f"--jobs {options.jobs}: chapters of profile {options.profile} are timed one at a time")
     try:
         whole = not (options.execute_only or options.only)
         front_page = build(ROOT, options.profile, options.only, not whole, options.jobs)

@@ -1,8 +1,8 @@
-"""Open every page of the rendered book in a real browser and list what a reader would stumble over.
+"""Open every page of the rendered book in a browser and list its problems.
 
     python book/tools/check_site.py _build/html/tiny
 
-Chromium is the system's. Exit status 1 if anything is found.
+Needs the system's Chromium. Exit status 1 if anything is found.
 """
 
 import argparse
@@ -27,24 +27,24 @@ NARROW = {"width": 360, "height": 740}  # pixels of a small phone
 WIDE = {"width": 1280, "height": 900}
 SEARCHED = "FedAvg"
 SEVERE = {"serious", "critical"}
-COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}  # what a change of theme can break
-REQUIRED = ("404.html", "sitemap.xml")  # what extensions of _config.yml make beside the pages of the contents
-VIDEO_BYTES = 1_000_000  # a video above this makes a reader on a phone wait
-# Headless, in a container without a graphics card, and asking the network for nothing but the pages.
+COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}  # rules that a theme can break
+REQUIRED = ("404.html", "sitemap.xml")  # made by extensions of _config.yml
+VIDEO_BYTES = 1_000_000  # larger videos load slowly on a phone
+# For a container without a GPU, and without network requests but for the pages.
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 ]  # fmt: skip
-BROWSERS = 2  # that share the pages; each keeps a core busy
-Look = Callable[[Page, str], list[str]]
-SHORT_ALT = 12  # characters; a shorter text does not say what a figure shows
+BROWSERS = 2  # in parallel; each uses a core
+Check = Callable[[Page, str], list[str]]
+SHORT_ALT = 12  # characters; shorter alternative texts do not describe a figure
 
-# Each returns a list of sentences about what is wrong on the page.
+# JavaScript functions that return a list of problems of the page.
 FIGURES = """() => [...document.querySelectorAll('main img')].flatMap(img => {
   const name = img.currentSrc.split('/').pop().slice(0, 60);
-  if (img.complete && img.naturalWidth === 0) return [`picture ${name} does not load`];
+  if (img.complete && img.naturalWidth === 0) return [`image ${name} does not load`];
   const alt = (img.getAttribute('alt') || '').trim();
-  if (alt.length < SHORT || /\\.(png|svg|jpg)$/.test(alt)) return [`picture ${name} has the alt text '${alt}'`];
+  if (alt.length < SHORT || /\\.(png|svg|jpg)$/.test(alt)) return [`image ${name} has the alt text '${alt}'`];
   return [];
 })""".replace("SHORT", str(SHORT_ALT))
 VIDEOS = """async () => (await Promise.all([...document.querySelectorAll('video')].map(async (video, i) => {
@@ -57,20 +57,20 @@ WIDTH = """() => document.documentElement.scrollWidth > innerWidth + 1
 DARK = """() => { document.documentElement.dataset.mode = 'dark'; document.documentElement.dataset.theme = 'dark'; }"""
 DARK_FIGURES = """() => [...document.querySelectorAll('main .cell_output img')].flatMap(img => {
   const [r, g, b, a] = getComputedStyle(img).backgroundColor.match(/[\\d.]+/g).map(Number);
-  return a !== 0 && Math.min(r, g, b) > 200 ? [] : ['a figure has no light ground in the dark theme'];
+  return a !== 0 && Math.min(r, g, b) > 200 ? [] : ['a figure has no light background in the dark theme'];
 })"""
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    """Serves files and says nothing."""
+    """Request handler without log messages."""
 
     def log_message(self, *_: object) -> None:
-        """Leave the terminal to what is found."""
+        """Print nothing."""
 
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a folder on this machine and yield its address."""
+    """Serve a folder on localhost and yield its URL."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_address[1]}/"
@@ -88,7 +88,7 @@ def pages(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a page's own text says: its anchors, its links, and the sources of its videos."""
+    """Anchors, links and video sources of a page."""
 
     anchors: frozenset[str]
     links: frozenset[str]
@@ -96,7 +96,7 @@ class Facts:
 
 
 def read(folder: Path, page: str) -> Facts:
-    """Return the facts of a page; films inside a page make it long, so each is read once."""
+    """Parse a page; embedded videos make pages large, so each is parsed once."""
     soup = BeautifulSoup((folder / page).read_text(encoding="utf-8"), "html.parser")
     return Facts(
         frozenset(tag["id"] for tag in soup.find_all(id=True)),
@@ -114,19 +114,19 @@ def dead_links(folder: Path, page: str, site: dict[str, Facts]) -> list[str]:
             continue
         path, anchor = unquote(target.path).lstrip("/"), unquote(target.fragment)  # 404.html links from the root
         if not (folder / path).is_file():
-            found.append(f"links to {href}, which is not there")
+            found.append(f"links to {href}, which does not exist")
         elif anchor and path in site and anchor not in site[path].anchors:
             found.append(f"links to {href}, which has no such anchor")
     return found
 
 
 def missing_files(folder: Path) -> list[str]:
-    """Return which of the files that every rendered book has are not there."""
+    """Return which of the `REQUIRED` files are missing."""
     return [f"{name} is missing" for name in REQUIRED if not (folder / name).is_file()]
 
 
 def heavy_videos(folder: Path, page: str, site: dict[str, Facts]) -> list[str]:
-    """Return the videos of a page that hold more than `VIDEO_BYTES`; inside the page, its text counts."""
+    """Return the videos of a page above `VIDEO_BYTES`; for embedded videos, the size of the data URI."""
     sizes = [_bytes_of(folder, page, source) for source in site[page].videos]
     return [f"video {i} has {size / 1e6:.1f} MB" for i, size in enumerate(sizes, start=1) if size > VIDEO_BYTES]
 
@@ -135,11 +135,11 @@ def _bytes_of(folder: Path, page: str, source: str) -> int:
     if source.startswith("data:"):
         return len(source)
     file = folder / unquote(urlparse(urljoin(page, source)).path).lstrip("/")
-    return file.stat().st_size if file.is_file() else 0  # the browser says that it is missing
+    return file.stat().st_size if file.is_file() else 0  # a missing file is found by the browser
 
 
 def look(page: Page, address: str) -> list[str]:
-    """Open a page, wide and narrow, light and dark, and return what is wrong with it."""
+    """Open a page, wide and narrow, in light and dark theme, and return its problems."""
     found: list[str] = []
     page.on("console", lambda said: found.append(f"console: {said.text[:160]}") if said.type == "error" else None)
     page.on("pageerror", lambda error: found.append(f"script: {str(error)[:160]}"))
@@ -149,15 +149,15 @@ def look(page: Page, address: str) -> list[str]:
     page.goto(address, wait_until="networkidle")
     found += page.evaluate(FIGURES) + page.evaluate(VIDEOS) + [f"light: {line}" for line in barriers(page)]
     page.evaluate(DARK)
-    page.wait_for_timeout(500)  # colours fade over
+    page.wait_for_timeout(500)  # colours change gradually
     found += page.evaluate(DARK_FIGURES) + [f"dark: {line}" for line in barriers(page, COLOURS)]
     page.set_viewport_size(NARROW)
     return found + page.evaluate(WIDTH)
 
 
 def barriers(page: Page, only: dict | None = None) -> list[str]:
-    """Return axe-core's serious findings, of all its rules or of those that `only` names."""
-    # Without preload: axe would read style sheets itself, from a wrong place, and be told 404.
+    """Return axe-core's serious findings, of all rules or of those in `only`."""
+    # Without preload: axe would fetch style sheets from a wrong path and get 404.
     options = {"preload": False, "resultTypes": ["violations"], **({"runOnly": only} if only else {})}
     violations = Axe().run(page, options=options).response["violations"]
     severe = [violation for violation in violations if violation["impact"] in SEVERE]
@@ -165,7 +165,7 @@ def barriers(page: Page, only: dict | None = None) -> list[str]:
 
 
 def searched(page: Page, address: str) -> list[str]:
-    """Return what is wrong with the search."""
+    """Return the problems of the search."""
     page.goto(f"{address}search.html?q={SEARCHED}", wait_until="networkidle")
     page.wait_for_timeout(2000)
     hits = page.locator("#search-results li").count()
@@ -173,7 +173,7 @@ def searched(page: Page, address: str) -> list[str]:
 
 
 def check(folder: Path, only: str = "") -> dict[str, list[str]]:
-    """Return what is wrong with each page of a site; pages with nothing are left out."""
+    """Return the problems of each page of a site that has any."""
     chosen = [page for page in pages(folder) if only in page]
     site = {page: read(folder, page) for page in pages(folder)}
     found = {page: dead_links(folder, page, site) + heavy_videos(folder, page, site) for page in chosen}
@@ -186,8 +186,8 @@ def check(folder: Path, only: str = "") -> dict[str, list[str]]:
     return {name: problems for name, problems in found.items() if problems}
 
 
-def _in_a_browser(jobs: list[tuple[str, Look, str]]) -> dict[str, list[str]]:
-    """Do each job on a fresh page of one browser and return what each found."""
+def _in_a_browser(jobs: list[tuple[str, Check, str]]) -> dict[str, list[str]]:
+    """Run each job on a fresh page of one browser and return the problems of each."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
         waiting = tqdm(jobs, desc="pages", disable=not sys.stderr.isatty())
@@ -196,7 +196,7 @@ def _in_a_browser(jobs: list[tuple[str, Look, str]]) -> dict[str, list[str]]:
     return found
 
 
-def _with_new_page(browser: Browser, do: Look, address: str) -> list[str]:
+def _with_new_page(browser: Browser, do: Check, address: str) -> list[str]:
     page = browser.new_page()
     try:
         return do(page, address)
@@ -212,7 +212,7 @@ def _chromium() -> str:
 
 
 def main() -> int:
-    """Check a site and print what was found."""
+    """Check a site and print its problems."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="the rendered book, such as _build/html/laptop")
     parser.add_argument("--only", default="", help="pages whose path contains this")

@@ -1,11 +1,11 @@
-"""Execute chapters as their readers do who took the zip: unpacked in an empty folder, from the library's wheel.
+"""Execute chapters as readers of the zip do: unpacked in an empty folder, with the library installed from its wheel.
 
-    python book/tools/check_zip.py              every chapter, at the profile tiny
+    python book/tools/check_zip.py              every chapter, with profile tiny
     python book/tools/check_zip.py --only 02
-    python book/tools/check_zip.py -n 2         what it does not know itself is for pytest: here, two chapters at a time
+    python book/tools/check_zip.py -n 2         other options are passed to pytest: here, two chapters in parallel
 
-The environment is a new one that sees the packages of this one, but not the source of the library. pytest --nbmake runs
-in it. Recordings in the cache are used again.
+A new environment sees this one's packages, but not the source of the library; pytest --nbmake runs in it. Cached
+recordings are reused.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import nbformat
 import make_zip
 
 CELL_TIMEOUT_S = 300
-# The last cell of each: the kernel is the new environment's, and so is the library that the chapter used.
+# Appended to each chapter: kernel and library must be those of the new environment.
 FROM_THE_WHEEL = """import sys
 from pathlib import Path
 
@@ -39,16 +39,16 @@ PROGRAM = "#!{python}\nimport sys\n\nfrom {module} import {attribute}\n\nsys.exi
 
 
 def unpack(book: Path, folder: Path) -> Path:
-    """Unpack the zip and return the folder that it makes."""
+    """Unpack the zip and return its folder."""
     with ZipFile(book) as packed:
         packed.extractall(folder)
     return folder / book.stem
 
 
 def new_environment(book: Path) -> Path:
-    """Make an environment in an unpacked book and return its Python: the wheel, and the packages that are here.
+    """Make an environment with the wheel and this environment's packages in an unpacked book, and return its Python.
 
-    A .pth file in the folder of packages that it points to is not read, so an editable install is not followed.
+    .pth files in the folder that others.pth points to are not read, so an editable install is not followed.
     """
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(book / ".venv")], check=True)
     python = book / ".venv" / "bin" / "python"
@@ -58,7 +58,7 @@ def new_environment(book: Path) -> Path:
         library.extractall(packages)
     (packages / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for program in entry_points(group="console_scripts"):
-        if program.module.split(".")[0] in ("flwr", "fedvla_lib"):  # what chapters start
+        if program.module.split(".")[0] in ("flwr", "fedvla_lib"):  # programs that chapters start
             text = PROGRAM.format(python=python, module=program.module, attribute=program.attr)
             (python.parent / program.name).write_text(text)
             (python.parent / program.name).chmod(0o755)
@@ -66,9 +66,9 @@ def new_environment(book: Path) -> Path:
 
 
 def surroundings(python: Path) -> dict[str, str]:
-    """Return the environment variables of a shell in which that Python's environment is the active one.
+    """Return the environment variables of a shell with that Python's environment activated.
 
-    Each chapter computes on one thread, so that several can run at a time.
+    Chapters compute on one thread, so that several can run in parallel.
     """
     outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     path = f"{python.parent}{os.pathsep}{outside['PATH']}"
@@ -76,16 +76,16 @@ def surroundings(python: Path) -> dict[str, str]:
 
 
 def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()) -> int:
-    """Execute chapters of an unpacked book with `pytest --nbmake`, each in its own folder, and return its exit status.
+    """Execute chapters of an unpacked book with `pytest --nbmake` and return its exit status.
 
-    A chapter also fails if its library did not come from the environment of `python`.
+    A chapter also fails if its library is not that of the environment of `python`.
     """
     for notebook in notebooks:
         content = nbformat.read(notebook, as_version=4)
         content.cells.append(nbformat.v4.new_code_cell(FROM_THE_WHEEL.format(prefix=str(python.parents[1]))))
         nbformat.write(content, notebook)
     book = python.parents[2]
-    alone = ["-c", os.devnull, "--rootdir", str(book), "-p", "no:cacheprovider"]  # no settings of folders above
+    alone = ["-c", os.devnull, "--rootdir", str(book), "-p", "no:cacheprovider"]  # no settings from parent folders
     nbmake = ["--nbmake", "--nbmake-timeout", str(CELL_TIMEOUT_S), "--durations", "0", *options]
     command = [str(python), "-m", "pytest", *alone, *nbmake, *map(str, notebooks)]
     return subprocess.run(command, cwd=book, env=surroundings(python), check=False).returncode
@@ -101,7 +101,7 @@ def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
     notebooks = [path for path in sorted((book / "notebooks").glob("*.ipynb")) if only in path.stem]
     if not notebooks:
         raise ValueError(f"no chapter of the zip has {only!r} in its name")
-    notebooks.reverse()  # the last are the longest: side by side, none is left when the others are done
+    notebooks.reverse()  # the last chapters take longest, so start them first
     python = new_environment(book)
     record = [str(python.parent / "fedvla"), "record", "--profile", "tiny"]  # as the zip's README says
     if subprocess.run(record, cwd=book, env=surroundings(python), check=False).returncode:
@@ -110,7 +110,7 @@ def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Check the zip; pytest says what each chapter took."""
+    """Check the zip; pytest prints the time of each chapter."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("--only", default="", metavar="TEXT", help="the chapters whose name contains TEXT")
     known, options = parser.parse_known_args(argv)

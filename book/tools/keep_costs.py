@@ -1,9 +1,9 @@
-"""Keep what the last build measured of each chapter, for the boxes at their tops.
+"""Store the costs that the last build measured, for the boxes at the tops of chapters.
 
     python book/tools/keep_costs.py --profile laptop
 
-Reads the executed copies of `make book` and writes `book/reference/costs/<profile>.json`. Measure on a machine that
-does nothing else.
+Reads the executed copies of `make book` and writes `book/reference/costs/<profile>.json`. Measure on an idle
+machine.
 """
 
 import argparse
@@ -23,32 +23,32 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def measured_in(executed: Path) -> dict[str, float | None]:
-    """Return seconds, memory and bytes of an executed chapter; None for what it does not say.
+    """Return seconds, memory and exchanged MB of an executed chapter; None if not measured.
 
     Raises:
-        ValueError: the copy was not made by a build of the book, or not alone.
+        ValueError: not executed by a build of the book, or in parallel with other chapters.
     """
     notebook = nbformat.read(executed, as_version=4)
     if "fedvla" not in notebook.metadata:
         raise ValueError(f"{executed.name} was not executed by make book")
     if (together := notebook.metadata["fedvla"].get("at_a_time", 1)) > 1:
         raise ValueError(f"{executed.name} was executed with {together} at a time: remove it, and run make book first")
-    said = [
+    costs = [
         output["metadata"][MEASURED]
         for cell in notebook.cells
         for output in cell.get("outputs", [])
         if MEASURED in output.get("metadata", {})
     ]
-    last = said[-1] if said else {}
-    costs = {name: last.get(name) for name in ("memory_mb", "exchanged_mb")}
-    return {"seconds": notebook.metadata["fedvla"]["seconds"], **costs}
+    last = costs[-1] if costs else {}
+    others = {name: last.get(name) for name in ("memory_mb", "exchanged_mb")}
+    return {"seconds": notebook.metadata["fedvla"]["seconds"], **others}
 
 
 def keep(root: Path, profile: str) -> Path:
-    """Write what the build at `profile` measured and return the file.
+    """Write the costs of the build with `profile` and return the file.
 
     Raises:
-        ValueError: a chapter of the contents was not executed; nothing is written then.
+        ValueError: a chapter was not executed; nothing is written.
     """
     folder = root / "_build" / profile / "executed"
     files = [folder / f"{Path(page).name}.ipynb" for page in toc_pages(root) if page.startswith("notebooks/")]
@@ -63,7 +63,7 @@ def keep(root: Path, profile: str) -> Path:
 
 
 def main() -> int:
-    """Keep the measurements and say where."""
+    """Store the costs and print the path."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profile", choices=list(PROFILES), default=os.environ.get("FEDVLA_PROFILE", "laptop"))
     try:

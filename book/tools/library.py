@@ -1,7 +1,4 @@
-"""The library as pages: every public function with the chapters that use it, and which module imports which.
-
-Both are read from the code and from the chapters each time that the book is built, so they cannot be out of date.
-"""
+"""Generated pages of the library: public functions with the chapters that use them, and the import graph."""
 
 import ast
 from collections.abc import Iterable, Iterator
@@ -19,7 +16,7 @@ ARROWHEAD = (
     '<polygon points="0,0 8,4 0,8" fill="#0072b2"/></marker></defs>'
 )
 LINE_STYLE = 'fill="none" stroke="#0072b2" stroke-width="2" marker-end="url(#head)"'
-CHAR, LINE, PAD, GAP, WIDTH = 6.6, 18, 12, 34, 760  # of the picture, in pixels
+CHAR, LINE, PAD, GAP, WIDTH = 6.6, 18, 12, 34, 760  # of the figure, in pixels
 
 
 def modules(root: Path) -> dict[str, ast.Module]:
@@ -167,7 +164,7 @@ def picture(graph: networkx.DiGraph) -> str:
 
 
 def _lines(names: list[str], width: float) -> list[str]:
-    """Names of modules, as many on a line as fit."""
+    """Module names, as many per line as fit."""
     lines = [""]
     for name in names:
         longer = f"{lines[-1]}   {name}".strip()

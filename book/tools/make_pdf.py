@@ -1,9 +1,9 @@
-"""Print the book: the executed chapters and all other pages as one PDF.
+"""Print the book, executed chapters and all other pages, as one PDF.
 
     python book/tools/make_pdf.py --profile laptop
 
-Chapters are not executed here, `make book` does that. Sphinx renders all pages as a single one, and the system's
-Chromium prints it; LaTeX would be a gigabyte more to install.
+Chapters are executed by `make book`. Sphinx renders one single page and the system's Chromium prints it; LaTeX would
+take another gigabyte.
 """
 
 import argparse
@@ -19,10 +19,10 @@ from check_site import FLAGS, _chromium
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "_build/fedvla-book.pdf"
-LOAD_S = 600  # a page with all figures and videos of the book
+LOAD_S = 600  # seconds for a page with all figures and videos of the book
 MARGIN = {"top": "18mm", "bottom": "18mm", "left": "16mm", "right": "16mm"}
-SCALE = 0.75  # letters of a printed book, and lines of code that fit
-# On paper nothing scrolls, and what belongs together stays on one page.
+SCALE = 0.75  # so that lines of code fit
+# No scrolling on paper, and no page breaks inside figures.
 STYLE = """
 td, th { white-space: normal !important; }
 pre, pre code { white-space: pre-wrap !important; overflow-wrap: anywhere; }
@@ -31,7 +31,7 @@ div.cell, div.cell_output, .table-wrapper { overflow: visible !important; }
 h1, h2, h3, h4, summary { break-after: avoid; }
 section.mathjax_ignore > h2 { break-before: page; } /* a chapter */
 """
-# On paper nothing can be opened, and a lazy picture that was never in view is blank.
+# Open all details, and load lazy images that were never in view.
 PREPARE = """async () => {
   document.documentElement.dataset.mode = document.documentElement.dataset.theme = 'light';
   document.querySelectorAll('details').forEach(one => { one.open = true; });
@@ -42,10 +42,10 @@ PREPARE = """async () => {
 
 
 def executed_chapters(root: Path, profile: str) -> list[Chapter]:
-    """Return the executed copies that `make book` left.
+    """Return the executed copies of `make book`.
 
     Raises:
-        BookError: one is missing or older than what it was made from; the message names it.
+        BookError: one is missing or outdated; the message names it.
     """
     library, folder = library_key(root, profile), root / "_build" / profile / "executed"
     notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file()]
@@ -56,17 +56,20 @@ def executed_chapters(root: Path, profile: str) -> list[Chapter]:
 
 
 def render_single(source: Path, output: Path) -> Path:
-    """Render a laid out book as a single page and return it; `make book` is where warnings are errors."""
+    """Render the book's source as a single page and return it; warnings are errors in `make book` only."""
     command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
-    # Where site_scripts.py lies, and the library whose functions are described.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT)])}
+    # For site_scripts.py and the documented packages.
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")]),
+    }
     done = subprocess.run(
         [*command, "--builder", "singlehtml", "--quiet"], env=environment, capture_output=True, text=True, check=False
     )
     page = output / "_build" / "singlehtml" / f"{toc_pages(source)[0]}.html"
     if done.returncode or not page.is_file():
         raise BookError(f"jupyter-book made no single page: {' '.join(done.stderr.split())[-800:]}")
-    # Sphinx writes its addresses of styles and pictures as if it lay at the top.
+    # Sphinx writes paths of styles and images relative to the top folder.
     return page.replace(output / "_build" / "singlehtml" / "printed.html")
 
 
@@ -88,14 +91,14 @@ def print_page(page: Path, target: Path) -> Path:
 
 
 def make(root: Path, profile: str) -> Path:
-    """Print the book that was executed at `profile`."""
+    """Print the book that was executed with `profile`."""
     chapters, work = executed_chapters(root, profile), root / "_build" / profile / "single"
     lay_out(root, work / "source", chapters, profile)
     return print_page(render_single(work / "source", work), root / TARGET)
 
 
 def main() -> int:
-    """Make the PDF and say where it is."""
+    """Make the PDF and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
     try:

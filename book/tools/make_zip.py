@@ -1,8 +1,8 @@
-"""Pack the notebooks, the stored results that they read, and the library, for readers who do not use git.
+"""Pack notebooks, stored results and the library into a zip, for readers without git.
 
     python book/tools/make_zip.py
 
-The library is built by its own build backend, setuptools, which the environment has; nothing is downloaded.
+The wheel is built with setuptools from this environment; nothing is downloaded.
 """
 
 import shutil
@@ -15,12 +15,12 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "_build/fedvla-book.zip"
-# Below one folder, as in the checkout: chapters read ../book/reference.
+# Same layout as the checkout: chapters read ../book/reference.
 PACKED = ["notebooks/*.ipynb", "book/reference/**/*", "requirements.lock", "LICENSE"]
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 README = """{title}
 
-The notebooks of the book, the stored results that they read, and the packages that they import. You need Python {python}.
+The notebooks of the book, the stored results that they read, and the packages that they import. Needs Python {python}.
 
 Install, in this folder:
 
@@ -28,7 +28,7 @@ Install, in this folder:
     .venv/bin/python -m pip install --require-hashes -r requirements.lock
     .venv/bin/python -m pip install --no-deps {wheel}
 
-See what the machine lacks, record the demonstrations (minutes), and start with chapter 1:
+Check the machine, record the demonstrations (minutes), and start with chapter 1:
 
     .venv/bin/fedvla doctor
     .venv/bin/fedvla record
@@ -37,10 +37,10 @@ See what the machine lacks, record the demonstrations (minutes), and start with 
 
 
 def build_wheel(root: Path, folder: Path) -> Path:
-    """Build the library's wheel into `folder`, from a copy: setuptools leaves its build folders beside the source.
+    """Build the library's wheel into `folder`, from a copy, since setuptools writes build folders next to the source.
 
     Raises:
-        ValueError: setuptools could not; the message is the end of what it said.
+        ValueError: the build failed; the message ends with setuptools' output.
     """
     with tempfile.TemporaryDirectory(prefix="fedvla-wheel-") as name:
         source = Path(name)
@@ -57,7 +57,7 @@ def build_wheel(root: Path, folder: Path) -> Path:
 
 
 def make(root: Path, target: Path) -> Path:
-    """Write the zip and return it; what it holds lies in one folder named like it."""
+    """Write the zip and return it; its contents are in one folder of the same name."""
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = target.with_name(target.name + ".unfinished")
     with tempfile.TemporaryDirectory(prefix="fedvla-zip-") as folder, ZipFile(unfinished, "w", ZIP_DEFLATED) as book:
@@ -80,7 +80,7 @@ def _readme(root: Path, wheel: str) -> str:
 
 
 def main() -> int:
-    """Make the zip and say where it is."""
+    """Make the zip and print its path."""
     try:
         target = make(ROOT, ROOT / TARGET)
     except (ValueError, OSError) as error:

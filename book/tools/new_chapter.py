@@ -1,6 +1,6 @@
-"""Make a chapter from the template: notebook, checks for its exercises, known mistakes, and where the book lists it.
+"""Make a chapter from the template: notebook, exercise checks and wrong answers, and list it in the book.
 
-    python book/tools/new_chapter.py 10_privacy
+python book/tools/new_chapter.py 10_privacy
 """
 
 import argparse
@@ -23,20 +23,20 @@ def make(root: Path, name: str) -> list[Path]:
     Raises:
         ValueError: the name is not of the form 10_privacy, or its number is taken.
     """
-    found = NAME.fullmatch(name)
-    if not found:
-        raise ValueError(f"{name!r} is no name of a chapter: give two digits and words, such as 10_privacy")
-    number, words = found.groups()
+    match = NAME.fullmatch(name)
+    if not match:
+        raise ValueError(f"{name!r} is no chapter name: give two digits and words, such as 10_privacy")
+    number, words = match.groups()
     taken = sorted(path.name for path in (root / "notebooks").glob(f"{number}_*.ipynb"))
     if taken:
         raise ValueError(f"number {number} is taken by {taken[0]}: choose another")
     title = words.replace("_", " ").capitalize()
-    words_of = {"CHAPTER_NAME": name, "CHAPTER": name.replace("_", "-"), "TITLE": title, "NN.": f"{number}."}
+    replacements = {"CHAPTER_NAME": name, "CHAPTER": name.replace("_", "-"), "TITLE": title, "NN.": f"{number}."}
     written = []
     for place, source in TEMPLATE.items():
         text = (ROOT / "book" / "template" / source).read_text(encoding="utf-8")
-        for word, meaning in words_of.items():
-            text = text.replace(word, meaning)
+        for old, new in replacements.items():
+            text = text.replace(old, new)
         path = root / place.format(name=name, number=number)
         path.write_text(text, encoding="utf-8")
         written.append(path)
@@ -46,7 +46,7 @@ def make(root: Path, name: str) -> list[Path]:
 
 
 def _list(contents: Path, name: str) -> None:
-    """Add the chapter behind the last one of the contents."""
+    """Add the chapter after the last one of the table of contents."""
     lines = contents.read_text(encoding="utf-8").splitlines(keepends=True)
     last = max(place for place, line in enumerate(lines) if "file: notebooks/" in line)
     indent = lines[last][: lines[last].index("-")]
@@ -55,7 +55,7 @@ def _list(contents: Path, name: str) -> None:
 
 
 def _announce(front_page: Path, name: str) -> None:
-    """Add the chapter, with a sentence to be replaced, behind the last one of the front page."""
+    """Add the chapter, with a placeholder sentence, after the last one of the front page."""
     before, last, after = front_page.read_text(encoding="utf-8").rpartition("{doc}`/notebooks/")
     told, end, rest = after.partition("\n\n")
     added = f"{last}{name}`\n: Say in one sentence what the reader builds here."
@@ -63,7 +63,7 @@ def _announce(front_page: Path, name: str) -> None:
 
 
 def main() -> int:
-    """Make the chapter and say what was written."""
+    """Make the chapter and print the written files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", help="two digits and words, such as 10_privacy")
     try:
