@@ -2,7 +2,8 @@
 
 A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are always the same. The best
 client of a run is selected on the same rollouts, which favours it. A client alone takes its share of the gradient
-steps, so its rate is what it gets at an equal total, not what it can reach. Finished seeds are kept and not measured again.
+steps, so its rate is what it gets at an equal total, not what it can reach. Finished seeds are
+kept and not measured again.
 
     python benchmarks/four_methods.py
 """
