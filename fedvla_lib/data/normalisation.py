@@ -51,7 +51,7 @@ def common_statistics(config: Config, pooled: Stats) -> Stats:
     return identity_stats() if config.normalisation == "none" else pooled
 
 
-def judging_statistics(config: Config, common: Stats, store: FrameStore) -> Stats:
+def evaluation_statistics(config: Config, common: Stats, store: FrameStore) -> Stats:
     """Return the statistics for evaluating the global model: `common`, or as a deliberate leak the held-out ones."""
     return common if config.normalisation != "held-out" else episode_stats(store, held_out_episodes(store, config))
 

@@ -85,7 +85,7 @@ def federate(
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster, weights, pooled = _introduce(grid, config, run)
     stats = normalisation.common_statistics(config, pooled)
-    bundle = model.load_policy(config, normalisation.judging_statistics(config, stats, store))
+    bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
     if saved:  # in the model's order, not the file's
         arrays, done = {name: saved.arrays[name] for name in arrays}, saved.round
