@@ -146,7 +146,7 @@ def test_resumed_training_ends_like_an_uninterrupted_one(tmp_path, capsys):
 
 
 def _undo_last_step(root: Path) -> None:
-    """Leave a run folder as a training that was killed after its first checkpoint leaves it."""
+    """Restore a run folder to its state after the first checkpoint, as if training had been killed then."""
     checkpoints = sorted((root / "checkpoints").iterdir())
     assert len(checkpoints) == 2
     for folder in (checkpoints[-1], root / "model"):

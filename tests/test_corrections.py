@@ -1,4 +1,4 @@
-"""What strategies add to local training, checked where the answer is known: on quadratics, and against autograd."""
+"""Corrections of local training by strategies, on problems with a known solution: quadratics, and autograd."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def local_phase(weight, k, correction=None, steps=STEPS):
 
 
 def quadratic_app(examples=(1, 1)) -> ClientApp:
-    """Two clients with different optima and curvatures, through the same code as the robot's clients."""
+    """Two clients with different optima and curvatures, on the same code as the robot's clients."""
     app = ClientApp()
 
     @app.train()
@@ -77,7 +77,7 @@ def serving(grid, examples, share, rounds_done=0, **settings):
 def federate(rounds, examples=(1, 1), share=1.0, replaced_after=0, **settings):
     """Run a strategy on the two quadratics from w = 0; return w after each round, the strategy and the clients' state.
 
-    After `replaced_after` rounds another server goes on with what a checkpoint has of the first.
+    After `replaced_after` rounds a new server continues from the checkpoint of the first.
     """
     grid, done = InlineGrid(quadratic_app(examples), 2, {}, raise_errors=True), 0
     strategy = serving(grid, examples, share, **settings)
@@ -99,7 +99,7 @@ def optimum(examples=(1, 1)):
 
 
 def shrink(k):
-    """Share of the distance to its own optimum that is left after a local phase of client k."""
+    """Fraction of the distance to its own optimum that is left after a local phase of client k."""
     return (1 - RATE * CURVATURE[k]) ** STEPS
 
 
@@ -116,7 +116,7 @@ def test_scaffold_finds_the_optimum_of_the_weighted_loss(examples):
     assert federate(80, examples, strategy="scaffold")[0][-1] == pytest.approx(optimum(examples), abs=1e-4)
 
 
-def test_scaffold_finds_the_optimum_when_one_client_of_two_is_drawn():
+def test_scaffold_finds_the_optimum_when_one_client_of_two_is_sampled():
     assert federate(150, share=0.5, strategy="scaffold")[0][-1] == pytest.approx(optimum(), abs=1e-3)
 
 
@@ -161,7 +161,7 @@ def test_control_variates_sum_to_zero_over_clients():
 
 @pytest.mark.parametrize(("examples", "share"), [((1, 1), 1.0), ((3, 1), 1.0), ((1, 9), 0.5)])
 def test_what_the_server_adds_up_is_the_weighted_mean_of_what_clients_keep(examples, share):
-    """So sum_k p_k (c_k - c) = 0, whoever was drawn: through the strategy and Flower's Context."""
+    """So sum_k p_k (c_k - c) = 0, whoever was sampled: with the strategy and Flower's Context."""
     _, strategy, kept = federate(7, examples, share, strategy="scaffold")
     own = [kept[f"{FIRST_NODE_ID + k}:{messages.CONTROL}"]["w"] for k in range(2)]
     assert abs(own[0] - own[1]) > 0.1
@@ -189,7 +189,7 @@ def test_the_proximal_pull_is_the_gradient_of_the_squared_distance():
     weight.grad.zero_()
     pull({"w": weight})
     torch.testing.assert_close(weight.grad, expected)
-    assert (weight.grad != 0).all()  # an anchor that is the live weights would pull nowhere
+    assert (weight.grad != 0).all()  # with the live weights as anchor the gradient would be 0
 
 
 def test_fedprox_without_weight_is_fedavg_to_the_last_bit():
@@ -240,8 +240,8 @@ def test_adaptive_strategies_equal_a_float64_reference(name):
 
 
 @pytest.mark.parametrize("name", ["fedavgm", "fedadam", "fedyogi", "scaffold"])
-def test_a_server_that_takes_over_goes_on_with_the_memory_of_the_first(name):
-    """Momentum, second moments, control variate, the number of the round and who is drawn in it."""
+def test_a_server_that_takes_over_continues_from_the_state_of_the_first(name):
+    """Momentum, second moments, control variate, round number and sampled clients."""
     settings = {"strategy": name, "share": 0.5}
     assert federate(8, replaced_after=4, **settings)[0] == federate(8, **settings)[0]
 

@@ -1,4 +1,4 @@
-"""Norms and angles of updates against hand-made ones."""
+"""Norms and angles of hand-made updates."""
 
 import numpy as np
 import pytest

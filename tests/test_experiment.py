@@ -80,7 +80,7 @@ def test_cells_come_seed_by_seed_and_only_those_wanted(file):
     [
         (("[methods.pooled]", "[methods.pooled"), "line"),
         (("rollouts = 2", ""), "lacks 'rollouts'"),
-        (("rollouts = 2", "rollouts = 2\nattempts = 3"), "'rollouts'"),
+        (("rollouts = 2", "rollouts = 2\nattempts = 3"), "unknown name 'attempts'"),
         (('kind = "centralized"', 'kind = "central"'), "'central'.*local-only"),
         (("num_clients = 2", "clients = 2"), "'clients'"),
         (("seeds = [0, 1]", "seeds = 3"), "seeds=3.*list of whole numbers"),

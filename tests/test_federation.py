@@ -1,6 +1,6 @@
 """The federation end to end, on a real nano SmolVLA and recorded demonstrations, in the inline engine.
 
-Faults are injected by real ClientApps around the library's own: they let it work and then damage its reply.
+Faults are injected by real ClientApps around the library's own: they call it and then damage its reply.
 """
 
 import time
@@ -36,14 +36,14 @@ NO_ROLLOUTS = {"eval_rollouts": 0, "client_rollouts": 0}
 
 @pytest.fixture(scope="module")
 def tiny(recording, tmp_path_factory):
-    """Settings of the tiny profile, from random weights, on the recording that all tests share."""
+    """Settings of the tiny profile, from the nano base, on the recording that all tests share."""
     out = tmp_path_factory.mktemp("outputs")
     return from_profile("tiny", base="nano", data=str(recording), num_threads=1, out=str(out))
 
 
 @pytest.fixture(scope="module")
 def full_run(tiny):
-    """A run with everything in it: three clients, two rounds, rollouts and videos after the last."""
+    """A complete run: three clients, two rounds, rollouts and videos after the last."""
     return inline.run_inline(replace(tiny, tasks="lift,push"), progress=False)
 
 
@@ -200,7 +200,7 @@ def test_nothing_held_out_is_trained_on_and_nobody_shares(tiny, scheme):
 
 
 def damaging(damage_of, tools) -> ClientApp:
-    """The library's ClientApp, whose training reply passes through ``damage_of[partition_id]`` where there is one."""
+    """The library's ClientApp, with ``damage_of[partition_id]``, if any, applied to the training reply."""
     inner, outer = client_app.build(tools), ClientApp()
 
     @outer.query()
@@ -222,7 +222,7 @@ def damaging(damage_of, tools) -> ClientApp:
 
 
 def change_arrays(change, *, honest: bool = True):
-    """Return a damage that changes the arrays, and the announced hash with them if it is to be `honest`."""
+    """Return a damage that changes the arrays and, if `honest`, the announced hash with them."""
 
     def damage(content: RecordDict) -> None:
         arrays = change(messages.unpack_arrays(content[messages.ARRAYS]))
@@ -278,7 +278,7 @@ def test_corrupted_replies_are_rejected_by_name_and_reason_and_the_round_goes_on
     assert "no space left on device" in rejected.detail.iloc[-1]
     counts = run_folder.read_metrics(root, "replies").query("to == 'train'").iloc[0]
     assert (counts.good, counts.rejected, counts.rejected_hash) == (1, 7, 1)
-    assert run_folder.counted_steps(root) == {"in_all": 1, "in_a_row": 1}  # what was averaged, not what was asked for
+    assert run_folder.counted_steps(root) == {"in_all": 1, "in_a_row": 1}  # averaged steps, not requested ones
 
     store = tools.open_frames(config)
     alone = open_client(config, 7, tools)
@@ -396,7 +396,7 @@ def test_a_kept_optimiser_goes_on_in_the_next_round(tiny):
     assert not same(global_weights(kept, 2), global_weights(reset, 2))
 
 
-def test_a_run_records_what_travelled_and_how_far_clients_moved(tiny):
+def test_a_run_records_the_bytes_exchanged_and_the_client_drift(tiny):
     config = replace(tiny, num_clients=2, num_server_rounds=1, **NO_ROLLOUTS)
     sizes = {}
     for name in ("fedavg", "scaffold"):
@@ -412,7 +412,7 @@ def test_a_run_records_what_travelled_and_how_far_clients_moved(tiny):
     assert drift["toward.client_1"][0] == pytest.approx(drift["toward.client_0"][1])
 
 
-def test_global_models_are_kept_and_measured_as_often_as_asked(tiny):
+def test_global_models_are_saved_and_measured_as_often_as_set(tiny):
     config = replace(tiny, num_clients=2, num_server_rounds=5, validate_every=3, **NO_ROLLOUTS)
     root = inline.run_inline(config, progress=False)
     events = run_folder.read_metrics(root, "evaluate")

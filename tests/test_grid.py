@@ -1,4 +1,4 @@
-"""Few messages at a time, where Flower's simulation would look through all of them for every client."""
+"""The throttled grid: few messages in flight in Flower's simulation runtime."""
 
 import time
 
@@ -20,7 +20,7 @@ CLIENTS = 10
 
 
 class Counting(InlineGrid):
-    """Notes how many messages it was given at a time."""
+    """Records how many messages it was given at a time."""
 
     def push_messages(self, messages):
         given = list(messages)
@@ -69,7 +69,7 @@ def test_only_the_grid_of_the_simulation_is_limited():
 
 
 class Asked(InMemoryGrid):
-    """The simulation's grid with many clients; stops the run at the first messages, and says how many they were."""
+    """The simulation's grid with many clients; at the first messages it stops the run with their number."""
 
     def get_node_ids(self):
         return range(1, 1 + 2 * MESSAGES_AT_ONCE)

@@ -46,7 +46,7 @@ def test_words_do_not_count(copied):
     before = provenance.code_digest(measure_cell)
     file = file_of(record.record)
     assert digest_after(file, "MAX_ATTEMPTS = 20  #", "MAX_ATTEMPTS = 20  # by the way,") == before
-    assert digest_after(file, '"""Expert demonstrations', '"""Demonstrations') == before
+    assert digest_after(file, '"""Records expert demonstrations', '"""Writes demonstrations') == before
     file.write_text(file.read_text().replace("\nimport numpy as np\n", "\nimport math\nimport numpy as np\n"))
     forget()
     assert provenance.code_digest(measure_cell) == before

@@ -1,4 +1,4 @@
-"""Rounded exchange: small errors, carried over, and nothing accepted that cannot be decoded."""
+"""Quantised exchange: rounding errors are small and carried over; arrays that cannot be decoded are rejected."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_zeros_and_huge_values_survive(exchange):
 
 @pytest.mark.parametrize("exchange", ROUNDED)
 def test_with_feedback_the_sum_over_rounds_is_right_up_to_one_rounding(exchange):
-    left_over, arrived, told = {}, np.zeros(SHAPES["weight"]), np.zeros(SHAPES["weight"])
+    left_over, arrived, exact = {}, np.zeros(SHAPES["weight"]), np.zeros(SHAPES["weight"])
     without = np.zeros(SHAPES["weight"])
     for number in range(60):
         now = change(number)
@@ -54,26 +54,26 @@ def test_with_feedback_the_sum_over_rounds_is_right_up_to_one_rounding(exchange)
         encoded, left_over = with_feedback(now, left_over, exchange)
         arrived += decode(encoded, exchange)["weight"]
         without += decode(encode(now, exchange), exchange)["weight"]
-        told += now["weight"]
-    np.testing.assert_allclose(arrived + left_over["weight"], told, atol=1e-6)
+        exact += now["weight"]
+    np.testing.assert_allclose(arrived + left_over["weight"], exact, atol=1e-6)
     one_rounding = np.abs(with_feedback(change(0), {}, exchange)[1]["weight"]).max()
-    assert np.abs(arrived - told).max() < 3 * one_rounding
+    assert np.abs(arrived - exact).max() < 3 * one_rounding
     if exchange == "int8":
         assert (without[0] == 0).all()  # lost in every round
-        assert abs(arrived[0].mean() - told[0].mean()) < 0.5 * told[0].mean()
+        assert abs(arrived[0].mean() - exact[0].mean()) < 0.5 * exact[0].mean()
 
 
 @pytest.mark.parametrize("exchange", ROUNDED)
 def test_a_client_keeps_the_remainder_in_its_context_and_sends_it_later(exchange):
     start, context = change(99, scale=1.0), Context(1, 2, {}, RecordDict(), {})
-    arrived, told = np.zeros(SHAPES["weight"]), np.zeros(SHAPES["weight"])
+    arrived, exact = np.zeros(SHAPES["weight"]), np.zeros(SHAPES["weight"])
     for number in range(60):
         after = {name: start[name] + array for name, array in change(number).items()}
-        told += after["weight"] - start["weight"]
+        exact += after["weight"] - start["weight"]
         sent = client_app._outgoing(after, start, exchange, context)
         arrived += decode(sent, exchange)["weight"]
     left_over = messages.unpack_arrays(context.state[client_app.LEFT_OVER])["weight"]
-    np.testing.assert_allclose(arrived + left_over, told, atol=1e-6)
+    np.testing.assert_allclose(arrived + left_over, exact, atol=1e-6)
     assert left_over.any()
 
 

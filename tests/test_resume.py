@@ -1,4 +1,4 @@
-"""A server killed in the middle of a round: the run goes on, and ends in the bits of one that was not killed."""
+"""A run that is killed in the middle of a round can be resumed and ends bit for bit like an uninterrupted one."""
 
 import contextlib
 import json
@@ -37,17 +37,17 @@ def tiny(recording, tmp_path):
 
 
 def start_until(config, round_number, engine_name="inline"):
-    """Run in processes of their own until clients train in a round; return the process and the run folder."""
-    told = {key: value for key, value in to_run_config(config).items() if key != "resume" and value != ""}
-    switches = [f"--{key}" if value else f"--no-{key}" for key, value in told.items() if isinstance(value, bool)]
-    values = [f"--{key}={value}" for key, value in told.items() if not isinstance(value, bool)]
+    """Start a run in a process and wait until clients train in a round; return the process and the run folder."""
+    given = {key: value for key, value in to_run_config(config).items() if key != "resume" and value != ""}
+    switches = [f"--{key}" if value else f"--no-{key}" for key, value in given.items() if isinstance(value, bool)]
+    values = [f"--{key}={value}" for key, value in given.items() if not isinstance(value, bool)]
     process = subprocess.Popen(
         [sys.executable, "-c", MAIN, "run", "--engine", engine_name, *switches, *values],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=heed_interrupts,
     )  # fmt: skip
     deadline = time.monotonic() + 300
-    # The round before has its checkpoint, so the next has begun.
+    # The round before has its checkpoint, so this one has begun.
     while not (found := list(Path(config.out).glob(f"*/checkpoints/round_{round_number - 1}"))):
         assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
         time.sleep(0.005)
@@ -55,7 +55,7 @@ def start_until(config, round_number, engine_name="inline"):
 
 
 def start_and_kill(config, round_number, engine_name="inline"):
-    """End everything without warning while clients train in a round, as in a power cut; return the run folder."""
+    """Kill all processes while clients train in a round, as a power cut would; return the run folder."""
     process, root = start_until(config, round_number, engine_name)
     assert run_folder.read_stamp(root)["status"] == "running"
     for one in [*psutil.Process(process.pid).children(recursive=True), process]:
@@ -67,7 +67,7 @@ def start_and_kill(config, round_number, engine_name="inline"):
 
 
 def start_kill_and_damage(config, round_number):
-    """As if the disk had failed under the last checkpoint: one bit of it is not what was written."""
+    """Kill a run and flip one bit of its last checkpoint, as a failing disk would."""
     root = start_and_kill(config, round_number)
     last = max((root / "checkpoints").glob("round_*"), key=lambda folder: int(folder.name.removeprefix("round_")))
     flip(last / "arrays.safetensors", -1)
@@ -75,7 +75,7 @@ def start_kill_and_damage(config, round_number):
 
 
 def flip(file, position):
-    """Turn one bit of a file."""
+    """Flip one bit of a file."""
     content = bytearray(file.read_bytes())
     content[position] ^= 1
     file.write_bytes(content)
@@ -92,12 +92,12 @@ def start_and_interrupt(config, round_number):
 
 
 def start_and_fill_the_disk(config, round_number):
-    """From a round on the process can write no file as large as a model, as on a disk without room for it."""
+    """From this round on the process cannot write a file as large as a model, as on a full disk."""
     if not hasattr(resource, "prlimit"):
-        pytest.skip("only Linux limits a process that runs")
+        pytest.skip("only Linux can limit a running process")
     process, root = start_until(config, round_number)
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
-    last = process.communicate(timeout=60)[1].splitlines()[-1]  # before it are the bars of progress
+    last = process.communicate(timeout=60)[1].splitlines()[-1]  # after the progress bars
     assert process.returncode == 2 and last.startswith(f"fedvla run: cannot write {root}/")
     assert "failed: OSError: cannot write" in run_folder.read_stamp(root)["status"]
     return root
@@ -140,7 +140,7 @@ def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, setti
 @pytest.mark.integration
 @pytest.mark.slow
 def test_a_simulation_killed_whole_goes_on_and_ends_in_the_same_bits(tiny):
-    """SuperLink, server and workers die together, as in a power cut; what they had written is enough."""
+    """SuperLink, server and workers are killed together, as in a power cut; the files that they wrote are enough."""
     whole = inline.run_inline(tiny, progress=False)
     config = replace(tiny, out=tiny.out + "_killed")
     root = start_and_kill(config, 2, "simulation")
@@ -173,12 +173,12 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
 
 @pytest.mark.unit
 def test_an_engine_that_cannot_reach_what_clients_keep_says_so_instead_of_resuming(tmp_path):
-    """In a deployment it lies with the clients, and is gone with the run."""
+    """In a deployment this state is in the clients' processes and ends with the run."""
     run, resumed = run_folder.RunFolder(tmp_path), from_profile("tiny", resume=str(tmp_path))
     checkpoint.save(tmp_path, Checkpoint(2, {"w": np.ones(3, np.float32)}, {}, {}))
     run.log(2, "global", "evaluate", {"loss": 1.0})
     for setting, value in KEEPING.items():
-        with pytest.raises(ValueError, match="lets clients keep something .* resume on engine inline, or start anew"):
+        with pytest.raises(ValueError, match="makes clients keep state .* resume on engine inline, or start a new run"):
             server_app._resume_from(replace(resumed, **{setting: value}), run, None)
     assert server_app._resume_from(resumed, run, None).round == 2
 
@@ -256,11 +256,11 @@ except OSError as error:
 
 
 @pytest.mark.unit
-def test_a_full_disk_is_an_error_of_one_line_that_names_the_file_and_leaves_the_checkpoint_before(tmp_path):
-    """In a process that may write no file of this size: what safetensors raises then is no OSError of its own."""
+def test_a_full_disk_is_an_error_of_one_line_that_names_the_folder_and_leaves_the_checkpoint_before(tmp_path):
+    """In a process with a limit on file sizes: safetensors then raises its own error, which is not an OSError."""
     checkpoint.save(tmp_path, Checkpoint(0, {"w": np.ones(3, np.float32)}, {}, {}))
     done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith(f"cannot write {tmp_path}/checkpoints/round_1/clients.safetensors: ")
+    assert done.stdout.startswith(f"cannot write {tmp_path}/checkpoints/round_1: ")
     assert done.stdout.count("\n") == 1
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["round_0"]
     assert checkpoint.load(tmp_path).round == 0

@@ -1,4 +1,4 @@
-"""Averaging and its checks, with Flower's own messages and apps on small arrays: no robot policy is needed here."""
+"""Aggregation and checks of replies, with Flower's messages and apps on small arrays, without a robot policy."""
 
 import hashlib
 import io
@@ -54,7 +54,7 @@ def reply_content(arrays, examples=10, loss=1.0, steps=2):
 
 
 def answering(content_of) -> ClientApp:
-    """A ClientApp whose training reply is whatever `content_of(partition_id, global arrays)` returns."""
+    """A ClientApp whose training reply is what `content_of(partition_id, global arrays)` returns."""
     app = ClientApp()
 
     @app.train()
@@ -67,7 +67,7 @@ def answering(content_of) -> ClientApp:
 
 
 class Events(list):
-    """Collects what a run folder would write."""
+    """Collects the events that a run folder would write."""
 
     def log(self, round_number, who, kind, values):
         self.append((round_number, who, kind, values))
@@ -79,7 +79,7 @@ class Events(list):
 def one_round(
     app, num_clients, *, start=None, server_round=1, reverse=False, announced=None, shapes=SHAPES, **settings
 ):
-    """Return the aggregated arrays, the metrics and the events of one training round with all clients, unless told."""
+    """Return the aggregated arrays, the metrics and the events of one training round; by default all clients train."""
     events = Events()
     grid = InlineGrid(app, num_clients, {})
     nodes = grid.get_node_ids()
@@ -175,7 +175,7 @@ GOOD = random_arrays(1)
 
 
 def _with_bias(content, dtype="float32", shape=(3,)):
-    """A good reply but for the bytes of one array."""
+    """A reply that is valid except for the bytes of one array."""
     record = ArrayRecord({**pack_arrays(GOOD), "bias": Array(dtype, shape, "numpy.ndarray", content)})
     return {**reply_content(GOOD), ARRAYS: record}
 
@@ -195,7 +195,7 @@ def _claiming(shape, descr="<f4"):
 
 
 class Trap:
-    """Unpickled, it would leave a file behind."""
+    """Creates a file when unpickled."""
 
     def __reduce__(self):
         return open, ("unpickled", "w")
@@ -262,7 +262,7 @@ def test_a_bad_reply_is_rejected_by_name_and_reason_and_the_round_goes_on(fault,
     for name in SHAPES:
         expected = (random_arrays(0)[name] + random_arrays(2)[name]) / 2
         np.testing.assert_allclose(averaged[name], expected, rtol=1e-6, atol=1e-7)
-    assert not list(tmp_path.iterdir())  # nothing that came was run
+    assert not list(tmp_path.iterdir())  # no received code was executed
 
 
 def flat(arrays):
@@ -271,7 +271,7 @@ def flat(arrays):
 
 @pytest.mark.parametrize("factor", [-20.0, -1.0, 50.0], ids=["scaled and turned", "turned", "scaled"])
 def test_one_poisoned_client_of_ten_breaks_fedavg_and_not_the_robust_strategies(factor):
-    """Honest clients move alike; the tenth sends its movement times a factor, with the right hash."""
+    """Honest clients send similar updates; the tenth sends its update times a factor, with a valid hash."""
     start, wanted = random_arrays(99), random_arrays(98)
 
     def moved(k, _):
@@ -300,7 +300,7 @@ def test_a_client_cannot_buy_weight_with_more_examples_than_it_came_with():
 
 
 def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
-    """A client that announced a thousand million frames from the start, and moves the other way."""
+    """A client that announces a billion frames from the start and sends an update in the opposite direction."""
     start, wanted = random_arrays(99), random_arrays(98)
 
     def moved(k, _):
@@ -311,21 +311,21 @@ def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
 
     length, limit = float(np.linalg.norm(flat(wanted))), 0.5
 
-    def movement(**settings):
+    def mean_update(**settings):
         arrays, _, events = one_round(answering(moved), 10, start=start, **settings)
         assert not events.rejected()
         return (flat(arrays) - flat(start)) / length, flat(wanted) / length
 
     for strategy in ("fedmedian", "krum"):
-        went, should = movement(strategy=strategy)
-        assert np.linalg.norm(went - should) < 0.5
-    went, should = movement(clip_norm=limit * length)
-    assert went @ should < 0 and np.linalg.norm(went) < 1.001 * limit  # where it says, but no further
-    went, should = movement()
-    assert went @ should < -4
+        update, honest = mean_update(strategy=strategy)
+        assert np.linalg.norm(update - honest) < 0.5
+    update, honest = mean_update(clip_norm=limit * length)
+    assert update @ honest < 0 and np.linalg.norm(update) < 1.001 * limit  # in its direction, but no further
+    update, honest = mean_update()
+    assert update @ honest < -4
 
 
-def test_clipping_shortens_a_movement_and_keeps_its_direction():
+def test_clipping_shortens_an_update_and_keeps_its_direction():
     start, far = random_arrays(99), random_arrays(99)
     far = {name: array + 50 for name, array in far.items()}
     app = answering(lambda k, _: reply_content(far))
@@ -344,7 +344,7 @@ def test_the_reason_of_an_exception_reaches_the_events():
     assert "disk on fire" in detail and "\n" not in detail
 
 
-def test_a_client_that_never_answers_is_reported():
+def test_a_client_that_does_not_reply_is_reported():
     events = Events()
     grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
@@ -360,35 +360,35 @@ def test_a_client_that_never_answers_is_reported():
     assert events.rejected() == {"client_1": "silent"}
 
 
-def test_too_few_good_replies_stop_the_run_in_clear_words():
+def test_too_few_valid_replies_stop_the_run_with_a_clear_message():
     app = answering(lambda k, _: reply_content(_nan(GOOD)) if k else reply_content(GOOD))
     with pytest.raises(TooFewReplies, match="round 4: 1 of 3 training replies are valid, min-replies=2"):
         one_round(app, 3, min_replies=2, server_round=4)
 
 
-def test_clients_are_drawn_from_the_seed_by_partition_not_by_node():
+def test_clients_are_sampled_from_the_seed_by_partition_not_by_node():
     rng = np.random.default_rng
     mirrored = Roster({1000 - k: k for k in range(20)})
     shifted = Roster({k + 77: k for k in range(20)})
     draws = []
     for roster in (mirrored, shifted):
-        drawn = [[roster.name(node) for node in roster.sample(0.3, rng([0, r, 0]))] for r in range(8)]
-        draws.append(drawn)
-        assert all(len(set(names)) == 6 for names in drawn)
+        names_by_round = [[roster.name(node) for node in roster.sample(0.3, rng([0, r, 0]))] for r in range(8)]
+        draws.append(names_by_round)
+        assert all(len(set(names)) == 6 for names in names_by_round)
     assert draws[0] == draws[1]
     assert len({tuple(names) for names in draws[0]}) > 1
     assert mirrored.sample(0.0, rng(0)) == []
     assert len(mirrored.sample(0.001, rng(0))) == 1
 
 
-def test_a_share_of_the_clients_is_asked():
-    asked = []
-    app = answering(lambda k, _: asked.append(k) or reply_content(random_arrays(k)))
+def test_a_share_of_the_clients_trains():
+    trained = []
+    app = answering(lambda k, _: trained.append(k) or reply_content(random_arrays(k)))
     one_round(app, 10, fraction_train=0.4, seed=3)
-    first = list(asked)
+    first = list(trained)
     one_round(app, 10, fraction_train=0.4, seed=3)
     assert len(first) == 4
-    assert asked == first * 2
+    assert trained == first * 2
 
 
 def test_what_a_client_does_to_a_message_stays_with_the_client():
@@ -424,7 +424,7 @@ def test_messages_carry_the_hash_that_clients_check():
 
 
 def statistics(count, **changed):
-    """What a client with these frames might send; `changed` measures replace the action's."""
+    """Statistics of a client with `count` frames; `changed` replaces measures of the action."""
     good = {"mean": np.zeros(6), "std": np.ones(6), "min": -np.ones(6), "max": np.ones(6), "count": np.array([count])}
     return {"observation.state": good, "action": {**good, **changed}}
 
@@ -432,7 +432,7 @@ def statistics(count, **changed):
 def introducing(
     partition_of, stats_of=lambda k, frames: normalisation.pack_stats(statistics(frames)), **said
 ) -> ClientApp:
-    """A ClientApp whose introduction is good, but for `said` of the node of partition 1."""
+    """A ClientApp whose introduction is valid, except for `said` of the node with partition 1."""
     app = ClientApp()
 
     @app.query()
@@ -451,7 +451,7 @@ def _without_measure(name):
 
 
 def _action(**changed):
-    """Statistics whose action is changed; values may be what NumPy would not write."""
+    """Statistics with changed measures of the action, also with values that NumPy would not write."""
     stats = json.loads(normalisation.pack_stats(statistics(6)))
     return json.dumps({**stats, "action": stats["action"] | changed})
 
@@ -509,7 +509,7 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
 
 @pytest.mark.parametrize("value", [0.1, -7e-30, 1e30])
 def test_joints_that_never_move_can_be_pooled(value):
-    """Rounding puts the mean of equal numbers a little beside them."""
+    """Through rounding, the mean of equal numbers can lie outside their range."""
 
     def stats_of(k, frames):
         measured = normalisation._describe(np.full((frames, 6), value, np.float32))
@@ -520,7 +520,7 @@ def test_joints_that_never_move_can_be_pooled(value):
     assert len(introduce_nodes(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0)[1]) == 60 and not events
 
 
-def test_roll_call_orders_by_partition_and_rejects_a_double():
+def test_introductions_are_ordered_by_partition_and_a_duplicate_is_rejected():
     events = Events()
     grid = InlineGrid(introducing([2, 0, 2, 1]), 4, {})
     roster, introductions = introduce_nodes(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)

@@ -73,8 +73,8 @@ def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
 
 @pytest.mark.unit
 def test_steps_are_those_that_were_done_not_those_that_were_asked_for(tmp_path):
-    run(6, checkpoint_dir=tmp_path)
-    _, again = run(4, checkpoint_dir=tmp_path, resume=True)  # the newest checkpoint lies behind what is asked for
+    run(6, checkpoints=Checkpoints(tmp_path))
+    _, again = run(4, checkpoints=Checkpoints(tmp_path, resume=True))  # the newest checkpoint lies behind what is asked for
     assert again.steps == len(again.losses) == 6
 
 

@@ -51,7 +51,7 @@ def imports(trees: dict[str, ast.Module]) -> networkx.DiGraph:
     graph.add_nodes_from(sorted(trees))
     for name, tree in trees.items():
         used = set()
-        for full in _names(tree).values():
+        for full in _imported(tree):
             inside = full.removeprefix(f"{PACKAGE}.")
             used |= {inside, inside.rpartition(".")[0]} & set(trees)
         graph.add_edges_from((name, other) for other in sorted(used))
@@ -64,6 +64,14 @@ def between_rooms(graph: networkx.DiGraph) -> networkx.DiGraph:
     found.add_nodes_from(room_of(name) for name in graph)
     found.add_edges_from((room_of(a), room_of(b)) for a, b in graph.edges if room_of(a) != room_of(b))
     return found
+
+
+def _imported(tree: ast.AST) -> set[str]:
+    """Full names of what is imported from the library, at the top or inside functions."""
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    froms = [node for node in nodes if (node.module or "").split(".")[0] == PACKAGE]
+    plain = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    return {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | plain
 
 
 def _names(tree: ast.AST) -> dict[str, str]:

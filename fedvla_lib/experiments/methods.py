@@ -20,7 +20,7 @@ from fedvla_lib.config import Config
 from fedvla_lib.data import normalisation
 from fedvla_lib.engines import inline
 from fedvla_lib.federation.client import Client, open_client, open_pooled
-from fedvla_lib.federation.nodes import draw_size
+from fedvla_lib.federation.nodes import sample_size
 from fedvla_lib.files import cache_dir
 from fedvla_lib.policy import model, nano, prefix_cache
 from fedvla_lib.policy.training import TrainResult, local_train
@@ -32,7 +32,7 @@ STEPS_FILE = "steps.json"  # next to a cached model's weights: its gradient step
 
 def total_steps(config: Config) -> int:
     """Planned gradient steps of a federated run, summed over clients; the budget of centralized training."""
-    return steps_in_a_row(config) * draw_size(config.fraction_train, config.num_clients)
+    return steps_in_a_row(config) * sample_size(config.fraction_train, config.num_clients)
 
 
 def steps_per_client(config: Config) -> int:

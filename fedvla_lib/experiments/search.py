@@ -22,7 +22,7 @@ from fedvla_lib.evaluation.rollouts import roll_out, rollout_seeds
 from fedvla_lib.experiments import methods
 from fedvla_lib.experiments.experiment import with_recording
 from fedvla_lib.experiments.plan import QUIET
-from fedvla_lib.federation.nodes import TooFewReplies, draw_size
+from fedvla_lib.federation.nodes import TooFewReplies, sample_size
 from fedvla_lib.files import write_json
 from fedvla_lib.policy.model import Bundle
 
@@ -97,7 +97,7 @@ def suggest(trial: Any, config: Config) -> Config:
         settings["server_lr"] = trial.suggest_float("server_lr", 1e-3, 2.0, log=True)
     if config.strategy == "fedprox":
         settings["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
-    steps_per_round = local_steps * draw_size(share, config.num_clients)
+    steps_per_round = local_steps * sample_size(share, config.num_clients)
     rounds = max(1, methods.total_steps(config) // steps_per_round)
     return check(replace(config, **settings, num_server_rounds=rounds))
 
