@@ -69,7 +69,8 @@ def serving(grid, examples, share, rounds_done=0, **settings):
     nodes = grid.get_node_ids()
     weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
     return build.build_strategy(
-        Config(fraction_train=share, **settings), weights, roster=Roster({node: node - FIRST_NODE_ID for node in nodes}), shapes={"w": (1,)},
+        Config(fraction_train=share, **settings), weights, shapes={"w": (1,)},
+        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
         report=lambda *_: None, keep_rollouts=lambda *_: None, rounds_done=rounds_done,
     )  # fmt: skip
 
