@@ -12,7 +12,7 @@ WRONG = {
         ),
         (
             "def tracking_error(s, a, d):\n    return np.abs(a - np.roll(s, -d, axis=0))[:, :5].mean()",
-            "that nothing follows",
+            "without a later state",
         ),
         (
             "def tracking_error(s, a, d):\n    return np.abs(a[: len(a) - d, :5] - s[d:, :5]).mean(axis=0)",
@@ -24,7 +24,7 @@ WRONG = {
             "def tracking_error(s, a, d):\n"
             "    pairs = zip(a[:-d, :5], s[d:, :5])\n"
             "    return sum(np.abs(x - y).mean() for x, y in pairs) / (len(a) - d)",
-            "every frame has its pair",
+            "every frame has a pair",
         ),
     ],
     "video_time": [
@@ -44,8 +44,7 @@ WRONG = {
             "where its file does",
         ),
         (
-            "def video_time(i, n, t, fps):\n"
-            "    return np.searchsorted(np.cumsum(n), i, side='right'), i / fps",
+            "def video_time(i, n, t, fps):\n    return np.searchsorted(np.cumsum(n), i, side='right'), i / fps",
             "not of the data set",
         ),
         (
@@ -56,7 +55,7 @@ WRONG = {
         (
             "def video_time(i, n, t, fps):\n    ends = np.cumsum(n)\n    k = np.searchsorted(ends, i, side='right')\n"
             "    return k, t[k] + (i - ends[k] + n[k] + 1) / fps",
-            "frames since then",
+            "the frames since then",
         ),
         (
             "def video_time(i, n, t, fps):\n    ends = np.cumsum(n)\n    k = np.searchsorted(ends, i, side='right')\n"
@@ -100,12 +99,12 @@ WRONG = {
         (
             "def chunk_at(a, row, end, size):\n    i = np.arange(row, row + size)\n"
             "    return a[np.minimum(i, end - 1)], i < end",
-            "what is real",
+            "marks real actions",
         ),
         (
             "def chunk_at(a, row, end, size):\n    i = np.arange(row, row + size)\n"
             "    return a[np.minimum(i, end - 1)], i > end",
-            "Padding begins",
+            "Padding starts",
         ),
     ],
     "normalised": [
@@ -133,7 +132,7 @@ WRONG = {
             "def normalised(a, index, ids):\n    z, seen = np.empty_like(a), np.isin(index, ids)\n"
             "    for part in (seen, ~seen):\n"
             "        z[part] = (a[part] - a[part].mean(axis=0)) / a[part].std(axis=0)\n    return z",
-            "the numbers of training",
+            "the statistics of training",
         ),
     ],
     "rollouts_needed": [

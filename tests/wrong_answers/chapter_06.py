@@ -40,18 +40,18 @@ def error_over_seeds(values):
 
 WRONG = {
     "steps_spent": [
-        (STEPS.format(steps="rounds * local_steps, total, total"), "not drawn in every round"),
-        (STEPS.format(steps="total // num_clients, total, rounds * local_steps"), "Centralized may spend"),
-        (STEPS.format(steps="total, total, total"), "share it out"),
+        (STEPS.format(steps="rounds * local_steps, total, total"), "not sampled in every round"),
+        (STEPS.format(steps="total // num_clients, total, rounds * local_steps"), "Centralized takes"),
+        (STEPS.format(steps="total, total, total"), "divide by the number"),
         (
             STEPS.format(steps="rounds * local_steps, *2 * (rounds * num_clients * local_steps,)"),
-            "only the clients that are drawn",
+            "only the sampled clients",
         ),
         (STEPS.format(steps="[rounds * local_steps] * 3"), "of the federation together take"),
-        (STEPS.format(steps="total"), "Three numbers"),
+        (STEPS.format(steps="total"), "three numbers"),
     ],
     "unpaired": [
-        ("def unpaired(left, right):\n    return set(left) - set(right)", "both sides"),
+        ("def unpaired(left, right):\n    return set(left) - set(right)", "Both sides"),
         (
             "def unpaired(left, right):\n    return {seed for _, seed in left} ^ {seed for _, seed in right}",
             "in another task",
@@ -59,7 +59,7 @@ WRONG = {
         ("def unpaired(left, right):\n    return [] if len(left) == len(right) else left", "are not enough"),
         (
             "def unpaired(left, right):\n    return [a for a, b in zip(left, right) if a != b]",
-            "the order they made them in",
+            "their order does not",
         ),
         (
             "def unpaired(left, right):\n"
@@ -73,7 +73,7 @@ WRONG = {
         (ERRORS.format(errors="pairs, apart"), "one rollout"),
         (ERRORS.format(errors="pairs / n, apart / n"), "over the root of n"),
         (ERRORS.format(errors="pairs / n**0.5, (left.std() + right.std()) / n**0.5"), "variances"),
-        (ERRORS.format(errors="pairs / n**0.5"), "Two numbers"),
+        (ERRORS.format(errors="pairs / n**0.5"), "two numbers"),
     ],
     "exact_p": [
         (EXACT.format(p="tail"), "one side"),
@@ -96,13 +96,13 @@ WRONG = {
     ],
     "error_over_seeds": [
         (PARTS.format(error="values.std() / values.size**0.5"), "counts every rollout"),
-        (PARTS.format(error="values.mean(axis=1).std(ddof=1) / seeds**0.5"), "same positions"),
-        (PARTS.format(error="np.sqrt((of_seeds + of_rollouts) / values.size)"), "take it off"),
+        (PARTS.format(error="values.mean(axis=1).std(ddof=1) / seeds**0.5"), "same rollouts"),
+        (PARTS.format(error="np.sqrt((of_seeds + of_rollouts) / values.size)"), "subtract it"),
         (PARTS.format(error="(of_seeds + of_rollouts - rest) / values.size"), "take the root"),
         (
             PARTS.format(error="np.sqrt((of_seeds + of_rollouts - (left**2).mean()) / values.size)"),
             "degrees of freedom",
         ),
-        (PARTS.format(error="values.std(axis=0)"), "One number"),
+        (PARTS.format(error="values.std(axis=0)"), "one number"),
     ],
 }

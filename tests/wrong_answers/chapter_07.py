@@ -1,6 +1,6 @@
 """Mistakes that readers make in the chapter on strategies, and a word of the hint that each gets."""
 
-SCAFFOLD = '''
+SCAFFOLD = """
 import numpy as np
 
 
@@ -13,7 +13,7 @@ def scaffold_round(gradients, w, own, drawn, rate, steps):
         after[k] = {new}
         ends.append(y)
     return {result}
-'''
+"""
 RIGHT = {
     "c": "own.mean()",
     "sign": "+",
@@ -28,7 +28,7 @@ WRONG = {
         ("def rounds_at_equal_steps(r, d, s, nd, ns):\n    return r * nd * ns / (d * s)", "fewer rounds"),
     ],
     "resting_point": [
-        ("def resting_point(a, b, rate, steps):\n    return b.mean()", "mean of the wishes"),
+        ("def resting_point(a, b, rate, steps):\n    return b.mean()", "clients' minima"),
         ("def resting_point(a, b, rate, steps):\n    return a @ b / a.sum()", "the optimum"),
         (
             "def resting_point(a, b, rate, steps):\n    moved = steps * rate * a\n    return moved @ b / moved.sum()",
@@ -39,12 +39,12 @@ WRONG = {
             "    left = (1 - rate * a) ** steps\n    return left @ b / left.sum()",
             "not gone",
         ),
-        ("def resting_point(a, b, rate, steps):\n    return (1 - (1 - rate * a) ** steps) @ b", "movements cancel"),
+        ("def resting_point(a, b, rate, steps):\n    return (1 - (1 - rate * a) ** steps) @ b", "updates cancel"),
     ],
     "pulls": [
-        ("def pulls(move):\n    return move(8.0) <= move(0.0)", "to the last bit"),
+        ("def pulls(move):\n    return move(8.0) <= move(0.0)", "without any effect"),
         ("def pulls(move):\n    return move(8.0) != move(0.0)", "wrong sign"),
-        ("def pulls(move):\n    return move(0.0) == 0.0", "which of two movements"),
+        ("def pulls(move):\n    return move(0.0) == 0.0", "which of two updates"),
         ("def pulls(move):\n    return move(8.0) < 0.5", "not one with a number"),
         ("def pulls(move):\n    return move(0.0) - move(8.0) > 1e-3", "not one with a number"),
     ],
@@ -52,7 +52,7 @@ WRONG = {
         (
             "def proximal_phase(gradient, start, steps, rate, mu):\n    w = start\n    for _ in range(steps):\n"
             "        w -= rate * (gradient(w) + mu * (w - start))\n    return w",
-            "move along",
+            "move with the weights",
         ),
         (
             "def proximal_phase(gradient, start, steps, rate, mu):\n    w, anchor = start, start.copy()\n"
@@ -81,11 +81,11 @@ WRONG = {
             "    return ends @ mean / np.linalg.norm(ends, axis=1) / np.linalg.norm(mean)",
             "compare weights",
         ),
-        ("def cosines(start, ends):\n    u = ends - start\n    return u @ u.mean(axis=0)", "both movements"),
+        ("def cosines(start, ends):\n    u = ends - start\n    return u @ u.mean(axis=0)", "both updates"),
         (
             "import numpy as np\n\n\ndef cosines(start, ends):\n    u = ends - start\n"
             "    return u @ u.mean(axis=0) / np.linalg.norm(u, axis=1)",
-            "mean movement as well",
+            "mean update as well",
         ),
         (
             "import numpy as np\n\n\ndef cosines(start, ends):\n    u = ends - start\n"
@@ -107,12 +107,12 @@ WRONG = {
         (
             "import numpy as np\n\n\ndef cosines(start, ends):\n    u = ends - start\n"
             "    return u @ u[0] / np.linalg.norm(u, axis=1) / np.linalg.norm(u[0]) - 0.1",
-            "product of two movements",
+            "product of two updates",
         ),
     ],
     "scaffold_round": [
-        (SCAFFOLD.format(**RIGHT | {"c": "own[drawn].mean()"}), "over the drawn ones"),
-        (SCAFFOLD.format(**RIGHT | {"sign": "-"}), "turned round"),
+        (SCAFFOLD.format(**RIGHT | {"c": "own[drawn].mean()"}), "over the sampled ones"),
+        (SCAFFOLD.format(**RIGHT | {"sign": "-"}), "reversed"),
         (SCAFFOLD.format(**RIGHT | {"c": "0.0"}), "each step adds"),
         (SCAFFOLD.format(**RIGHT | {"new": "own[k] + (w - y) / (steps * rate)"}), "too large by c"),
         (SCAFFOLD.format(**RIGHT | {"new": "own[k] - c + (w - y)"}), "mean of the gradients"),

@@ -1,7 +1,7 @@
-"""The checker behind the exercises: ``check("02.pooled_std", pooled_std)`` says what is right, or gives a hint.
+"""Checks of the exercises: ``check("02.pooled_std", pooled_std)`` confirms an answer or gives a hint.
 
-A chapter's checks are functions of its module here, named like the exercise; each calls the reader's answer on cases
-of its own and raises `Hint` where the answer is not right yet. A wrong answer never stops the notebook.
+A chapter's checks are functions of its module here, named like the exercise; each tests the reader's answer and raises
+`Hint` if it is not right. A wrong answer never stops the notebook.
 """
 
 from collections.abc import Callable
@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-EMPTY = "Nothing is there yet: replace the three dots."
+EMPTY = "There is no answer yet: replace the three dots."
 
 
 class Hint(Exception):
-    """What is missing in an answer, in a sentence that helps to find it."""
+    """An answer is wrong; the message is a hint."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check found; a notebook shows it as a line of text."""
+    """Result of a check, shown as a line of text."""
 
     name: str
     hint: str  # empty if the answer is right
@@ -39,17 +39,17 @@ class Verdict:
 
 
 def check(exercise: str, answer: Any) -> Verdict:
-    """Check an answer to an exercise, ``"chapter.name"``: a function, or a value.
+    """Check the answer to an exercise ``"chapter.name"``: a function or a value.
 
     Raises:
-        ValueError: there is no such exercise.
+        ValueError: unknown exercise.
     """
     chapter, _, name = exercise.partition(".")
-    judge = _checks(chapter).get(name)
-    if judge is None:
+    checker = _checks(chapter).get(name)
+    if checker is None:
         raise ValueError(f"unknown exercise {exercise!r}: choose from {', '.join(known(chapter)) or '01. to 09.'}")
     try:
-        judge(_asked(answer) if callable(answer) else _filled(answer))
+        checker(_wrapped(answer) if callable(answer) else _filled(answer))
     except Hint as hint:
         return Verdict(name, str(hint))
     return Verdict(name, "")
@@ -65,22 +65,22 @@ def _checks(chapter: str) -> dict[str, Callable[[Any], None]]:
         module = import_module(f"fedvla_book.exercises.chapter_{chapter}")
     except ModuleNotFoundError:
         return {}
-    own = {name: thing for name, thing in vars(module).items() if getattr(thing, "__module__", "") == module.__name__}
-    return {name: thing for name, thing in own.items() if callable(thing) and not name.startswith("_")}
+    own = {name: item for name, item in vars(module).items() if getattr(item, "__module__", "") == module.__name__}
+    return {name: item for name, item in own.items() if callable(item) and not name.startswith("_")}
 
 
-def _asked(answer: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap the reader's function, so that an error in it becomes a hint, and so does an answer that is not there."""
+def _wrapped(answer: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap the reader's function so that an error in it, or a missing result, becomes a hint."""
 
     @wraps(answer)
-    def ask(*arguments: Any, **named: Any) -> Any:
+    def call(*arguments: Any, **named: Any) -> Any:
         try:
             given = answer(*arguments, **named)
         except Exception as error:
             raise Hint(f"Your code raises {type(error).__name__}: {error}") from error
         return _filled(given)
 
-    return ask
+    return call
 
 
 def _filled(given: Any) -> Any:
@@ -90,16 +90,16 @@ def _filled(given: Any) -> Any:
 
 
 def expect(right: bool, hint: str) -> None:
-    """Raise `Hint` unless something is right."""
+    """Raise `Hint` if `right` is false."""
     if not right:
         raise Hint(hint)
 
 
 def close(given: Any, expected: Any, tolerance: float = 1e-6) -> bool:
-    """Whether numbers or arrays agree in shape and, up to `tolerance` (relative and absolute), in every value."""
+    """Whether numbers or arrays have the same shape and values, up to a relative and absolute `tolerance`."""
     try:
-        found = np.asarray(given, dtype=float)
+        values = np.asarray(given, dtype=float)
     except (TypeError, ValueError) as error:
-        raise Hint(f"A number or an array of numbers is wanted, not {given!r}.") from error
+        raise Hint(f"Expected a number or an array of numbers, not {given!r}.") from error
     wanted = np.asarray(expected, dtype=float)
-    return found.shape == wanted.shape and np.allclose(found, wanted, rtol=tolerance, atol=tolerance, equal_nan=True)
+    return values.shape == wanted.shape and np.allclose(values, wanted, rtol=tolerance, atol=tolerance, equal_nan=True)

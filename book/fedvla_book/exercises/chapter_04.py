@@ -15,38 +15,41 @@ def good_average(average: Callable[..., np.ndarray]) -> None:
     """``average(updates, frames)`` averages arrays by frames, without the clients that sent a value not finite."""
     updates = [np.array([1.0, 2.0]), np.array([5.0, -2.0]), np.array([3.0, np.nan])]
     given = average(updates, [300, 100, 600])
-    expect(np.shape(given) == (2,), f"Two values are wanted, one for each entry, not the shape {np.shape(given)}.")
-    expect(not close(np.ravel(given)[0], 2.6), "One bad value, and the whole reply is out, its good values as well.")
+    expect(np.shape(given) == (2,), f"Expected two values, one for each entry, not the shape {np.shape(given)}.")
+    expect(not close(np.ravel(given)[0], 2.6), "One bad value excludes the whole reply, its good values as well.")
     expect(np.isfinite(given).all(), "NaN is in the average: leave the client out first; zero times NaN is NaN.")
     expect(not close(given, [0.8, 0.4]), "The shares no longer add up to 1: divide by the frames of those that remain.")
     expect(not close(given, [3.0, 0.0]), "A client with more frames has to count more.")
     expect(close(given, [2.0, 1.0]), "Average those that sent finite values only, each by its frames.")
     given = average([np.array([np.inf, 0.0]), np.array([2.0, 4.0]), np.array([6.0, 8.0])], [10, 30, 10])
-    expect(close(given, [3.0, 5.0]), "Another client sends an infinite value: that is not finite either.")
+    expect(close(given, [3.0, 5.0]), "Another client sends an infinite value, which is not finite either.")
 
 
 def rounds_within(count: Callable[..., int]) -> None:
-    """``count(budget_mb, parameters, trainers, evaluators)``: whole rounds whose messages fit, both ways, float32."""
+    """``count(budget_mb, parameters, trainers, evaluators)``: complete rounds whose messages fit (float32, both ways)."""
     given = count(170, 500_000, 4, 10)
-    expect(given != 10, "A client that evaluates needs the weights as well: count that way down.")
-    expect(given != 3, "Who evaluates sends numbers back, no weights: nothing to count on that way up.")
-    expect(given != 21, "Weights travel down as well, to those that train and to those that evaluate.")
-    expect(given != 6, "Those that train send weights back: count the way up.")
+    expect(given != 10, "A client that evaluates receives the weights as well: count that download.")
+    expect(given != 3, "A client that evaluates sends numbers back, no weights: do not count an upload.")
+    expect(given != 21, "Weights are sent down as well, to clients that train and to those that evaluate.")
+    expect(given != 6, "Clients that train send weights back: count the upload.")
     expect(given != 18, "float32 takes four bytes for each parameter.")
-    expect(float(given).is_integer() and given != 5, "Only whole rounds count, and the last one has to fit.")
-    expect(given == 4, "A round moves the weights twice for each that trains and once for each that evaluates.")
+    expect(float(given).is_integer() and given != 5, "Only complete rounds count, and the last one has to fit.")
+    expect(given == 4, "A round sends the weights twice per client that trains and once per client that evaluates.")
     expect(count(27, 250_000, 3, 3) == 3, "A budget that fits exactly is enough.")
 
 
 def round_losses(average: Callable[[list[dict[str, Any]]], Mapping[int, float]]) -> None:
-    """``average(events)`` maps each round to its training loss, averaged over who trained in it, by frames."""
+    """``average(events)`` maps each round to its training loss, averaged over the clients that trained, by frames."""
     given = average([*_EVENTS])
     expect(isinstance(given, Mapping), "Return a dict: for each round its loss.")
-    expect(0 not in given, "In round 0 nobody trains, and yet it is measured: look at the kind of each event.")
-    expect(set(given) == {1, 2}, "One entry for each round in which somebody trained is wanted.")
+    expect(0 not in given, "In round 0 no client trains, the model is only evaluated: look at the kind of each event.")
+    expect(set(given) == {1, 2}, "Return one entry for each round in which a client trained.")
     found = [given[1], given[2]]
     expect(not close(found, [2.0, 1.25]), "A client with more frames counts more here, too.")
-    expect(not close(found, [1.0, 550 / 600]), "Divide by the frames of those that trained in this round, not of all.")
+    expect(
+        not close(found, [1.0, 550 / 600]),
+        "Divide by the frames of the clients that trained in this round, not of all.",
+    )
     expect(close(found, [1.5, 1.1]), "Take the loss and the frames of each event of kind train, and of no other kind.")
     alone = average([_event(5, "client_1", "train", 0.7, 40)])
     expect(dict(alone).keys() == {5} and close(alone[5], 0.7), "Rounds need not begin at 1: take them from the events.")
@@ -69,7 +72,7 @@ _EVENTS = [
 
 
 def federated_round(train: Callable[..., np.ndarray]) -> None:
-    """``train(parts, weights, rate, local_steps)`` is the average, by frames, of what each client's steps end with."""
+    """``train(parts, weights, rate, local_steps)`` averages the clients' weights after local steps by frames."""
     rng = np.random.default_rng(4)
     parts = [(rng.normal(k, 1, (n, 2)), rng.normal(size=n)) for k, n in enumerate((5, 20, 10))]
     pooled = [tuple(np.concatenate(values) for values in zip(*parts, strict=True))]
@@ -81,12 +84,12 @@ def federated_round(train: Callable[..., np.ndarray]) -> None:
         ends = np.stack([_descended([part], weights, local_steps) for part in parts])
         chained = np.stack([_descended(parts[: k + 1], weights, local_steps) for k in range(3)])
         for after in (chained[-1], chained.mean(axis=0), frames @ chained / 35):
-            expect(not close(given, after), "Each client begins at the server's weights, not where another stopped.")
-        expect(not close(given, ends.mean(axis=0)), "Not all clients count the same: weigh them by their frames.")
+            expect(not close(given, after), "Each client starts from the server's weights, not where another stopped.")
+        expect(not close(given, ends.mean(axis=0)), "Not all clients count the same: weight them by their frames.")
         right = frames @ ends / 35
         expect(local_steps > 1 or close(given, right), "With one local step it has to be one step on all data at once.")
         together = _descended(pooled, weights, local_steps)
-        own = "In several local steps clients part: average once, after the last, not after each."
+        own = "With several local steps clients diverge: average once, after the last, not after each."
         expect(local_steps == 1 or not close(given, together), own)
         expect(close(given, right), "Take all local steps of a client in a row, each from where the last one ended.")
 
@@ -103,16 +106,16 @@ def in_any_order(average: Callable[[list[tuple[int, int, np.ndarray]]], np.ndarr
     """``average(replies)`` of (partition, frames, array) is the average by frames, with bits that ignore the order."""
     uneven = [(2, 30, np.float32([1, 4])), (0, 10, np.float32([5, 0]))]
     given = average([*uneven])
-    expect(not close(given, [3.0, 2.0]), "By frames, please: a client with more of them counts more.")
+    expect(not close(given, [3.0, 2.0]), "Weight by frames: a client with more of them counts more.")
     expect(close(given, [2.0, 3.0]), "The average is the sum of frames times array, over the sum of frames.")
     alike = [(k, 10, np.float32([value, 1])) for k, value in enumerate((1e8, 1e-9, -1e8, 3e-9))]
     found = [average([*order]) for order in permutations(alike)]
     same = all(np.array_equal(one, found[0]) for one in found)
-    expect(same, "Other orders of arrival give other bits: sum in an order of which nobody's speed is part.")
+    expect(same, "Other orders of arrival give other bits: sum in an order that does not depend on arrival.")
 
 
 def surviving(share: Callable[..., float]) -> None:
-    """``share(start, updates, frames)`` is the length of the mean movement over the mean length of movements."""
+    """``share(start, updates, frames)`` is the norm of the mean update over the mean norm of the updates."""
     for seed in (0, 1):
         rng = np.random.default_rng(seed)
         start = {name: 5 + rng.normal(size=shape) for name, shape in (("a", (3,)), ("b", (2, 2)))}
@@ -121,14 +124,14 @@ def surviving(share: Callable[..., float]) -> None:
         given = share(start, updates, frames)
         nothing = {name: np.zeros_like(array) for name, array in start.items()}
         of_weights = _survives(nothing, updates, frames)
-        expect(not close(given, of_weights), "You compare weights, and those are nearly alike: subtract the start.")
+        expect(not close(given, of_weights), "You compare weights, which are nearly equal: subtract the start.")
         right = _survives(start, updates, frames)
-        expect(not close(given, 1 / right), "It is turned over: no more can survive than there was.")
+        expect(not close(given, 1 / right), "It is inverted: the ratio cannot exceed 1.")
         alike = _survives(start, updates, [1, 1, 1])
-        expect(not close(given, alike), "Clients count by their frames, above and below.")
+        expect(not close(given, alike), "Weight clients by their frames, in numerator and denominator.")
         apart = [_survives({n: start[n]}, updates, frames) for n in start]
-        expect(not close(given, np.mean(apart)), "One length over all arrays together, not one for each array.")
-        expect(close(given, right), "Above: the length of the mean movement. Below: the mean of the lengths.")
+        expect(not close(given, np.mean(apart)), "One norm over all arrays together, not one for each array.")
+        expect(close(given, right), "Numerator: the norm of the mean update. Denominator: the mean of the norms.")
 
 
 def _survives(start: Weights, updates: list[Weights], frames: Sequence[int]) -> float:

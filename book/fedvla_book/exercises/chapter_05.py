@@ -9,33 +9,33 @@ from fedvla_book.exercises import close, expect
 
 
 def incomplete(find: Callable[..., Sequence[int]]) -> None:
-    """``find(frames, steps, row_steps)`` lists the places where video, trajectory and row differ in length."""
+    """``find(frames, steps, row_steps)`` lists the indices where video, trajectory and row differ in length."""
     frames = np.array([40, 0, 55, 60, 70, 33, 45])
     steps = np.array([40, 50, 65, 60, 60, 33, 44])
     given = np.asarray(find(frames, steps, np.array([40, 50, 65, 58, 60, 33, 45])))
-    expect(given.dtype != bool, "You return a mask; its places are wanted, such as [1, 4].")
+    expect(given.dtype != bool, "You return a mask; return its indices, such as [1, 4].")
     found = set(given.ravel().tolist())
-    expect(not found & {0, 5}, "Rollouts 0 and 5 are whole: all three of their lengths agree.")
-    expect(found != {1}, "A video that opens can still lack its end: compare its length with that of the attempt.")
-    expect(4 in found, "A video can also be too long, as one of another attempt would be.")
-    expect(3 in found, "The row is a third witness: a video and a trajectory that agree may not be its own.")
+    expect(not found & {0, 5}, "Rollouts 0 and 5 are complete: all three lengths agree.")
+    expect(found != {1}, "A video that opens can still lack its end: compare its length with that of the rollout.")
+    expect(4 in found, "A video can also be too long, such as one of another rollout.")
+    expect(3 in found, "Check the row, too: a video and a trajectory that agree may belong to another rollout.")
     expect(found == {1, 2, 3, 4, 6}, f"1, 2, 3, 4 and 6 have a length that differs, you list {sorted(found)}.")
     expect(len(find(steps, steps, steps)) == 0, "If all lengths agree, the list has to be empty.")
 
 
 def wilson_interval(interval: Callable[[int, int], tuple[float, float]]) -> None:
-    """``interval(successes, attempts)`` returns the lower and the upper end of Wilson's 95 % interval."""
+    """``interval(successes, rollouts)`` returns the lower and the upper end of Wilson's 95 % interval."""
     none = interval(0, 20)
-    expect(np.shape(none) == (2,), "Two numbers are wanted: the lower end, then the upper.")
-    expect(not close(*none), "20 failures do not prove a rate of 0, but your interval there has no width.")
-    for successes, attempts in ((14, 20), (5, 5), (0, 20), (1, 3)):
-        given, case = np.asarray(interval(successes, attempts)), f"{successes} of {attempts}"
-        right = np.array(binomtest(successes, attempts).proportion_ci(method="wilson"))
-        expect(not close(given[::-1], right, 1e-3), "The ends are swapped: the lower one first.")
-        narrow = binomtest(successes, attempts).proportion_ci(confidence_level=0.9, method="wilson")
-        expect(not close(given, narrow, 1e-3), "That is a 90 % interval: z has to leave out 2.5 % on each side.")
-        undivided = right * (1 + norm.ppf(0.975) ** 2 / attempts)
-        expect(not close(given, undivided, 1e-3), "The last division is missing: all of it is over 1 + z²/n.")
+    expect(np.shape(none) == (2,), "Return two numbers: the lower end, then the upper.")
+    expect(not close(*none), "20 failures do not prove a rate of 0, but your interval has no width there.")
+    for successes, rollouts in ((14, 20), (5, 5), (0, 20), (1, 3)):
+        given, case = np.asarray(interval(successes, rollouts)), f"{successes} of {rollouts}"
+        right = np.array(binomtest(successes, rollouts).proportion_ci(method="wilson"))
+        expect(not close(given[::-1], right, 1e-3), "The ends are swapped: lower end first.")
+        narrow = binomtest(successes, rollouts).proportion_ci(confidence_level=0.9, method="wilson")
+        expect(not close(given, narrow, 1e-3), "That is a 90 % interval: z must leave out 2.5 % on each side.")
+        undivided = right * (1 + norm.ppf(0.975) ** 2 / rollouts)
+        expect(not close(given, undivided, 1e-3), "The last division is missing: everything is over 1 + z²/n.")
         expect(close(given.mean(), right.mean(), 1e-3), f"The middle is off for {case}: it is p + z²/(2n), divided.")
         expect(close(given, right, 1e-3), f"The middle is right for {case}, the width is not: look at the root.")
 
@@ -45,17 +45,17 @@ def faster_by(seconds: Callable[[np.ndarray, np.ndarray], float]) -> None:
     nan = float("nan")
     before, after = np.array([4.0, 5.0, nan, 9.0, 12.0]), np.array([4.4, 5.8, 7.0, nan, nan])
     given = seconds(before, after)
-    expect(np.shape(given) == (), "One number is wanted, the mean over seeds.")
-    expect(not close(given, nan), "NaN spreads: leave out the seeds that have no time.")
+    expect(np.shape(given) == (), "Expected one number, the mean over seeds.")
+    expect(not close(given, nan), "NaN propagates: leave out the seeds without a time.")
     expect(not close(given, np.nanmean(before) - np.nanmean(after)), "Your two means are over different seeds.")
     expect(not close(given, np.mean(np.nan_to_num(before) - np.nan_to_num(after))), "A failure does not take 0 s.")
-    expect(not close(given, 0.6), "The sign is turned round: slower on both seeds is a negative saving.")
-    expect(close(given, -0.6), "Take the seeds that both models solve, and the mean of before minus after there.")
+    expect(not close(given, 0.6), "The sign is reversed: slower on both seeds is a negative saving.")
+    expect(close(given, -0.6), "Take the seeds that both models solve, and the mean of before minus after.")
     expect(close(seconds(after + 3, after), 3.0), "If every success takes 3 s less, 3 s are saved.")
 
 
 def jump_ratio(ratio: Callable[[np.ndarray, int], float]) -> None:
-    """``ratio(actions, n_action_steps)`` is the mean change where plans meet over the mean change elsewhere."""
+    """``ratio(actions, n_action_steps)`` is the mean change where chunks meet over the mean change elsewhere."""
     rng = np.random.default_rng(5)
     for plan, steps in ((8, 45), (5, 31)):
         starts = np.arange(steps) // plan
@@ -64,14 +64,17 @@ def jump_ratio(ratio: Callable[[np.ndarray, int], float]) -> None:
         given, change = ratio(actions, plan), np.diff(actions, axis=0)
         meet = np.diff(starts) == 1
         right = _over(np.abs(change), meet)
-        expect(np.shape(given) == (), "One number is wanted, over all joints and steps.")
-        expect(not close(given, 1 / right), "It is upside down: where plans meet over elsewhere.")
-        expect(not close(given, _over(change, meet)), "Ups and downs cancel: take absolute values before the mean.")
+        expect(np.shape(given) == (), "Expected one number, over all joints and steps.")
+        expect(not close(given, 1 / right), "It is inverted: where chunks meet over elsewhere.")
+        expect(
+            not close(given, _over(change, meet)),
+            "Changes of opposite sign cancel: take absolute values before the mean.",
+        )
         all_steps = np.abs(change)[meet].mean() / np.abs(change).mean()
-        expect(not close(given, all_steps), "Leave the places where plans meet out of the second mean.")
+        expect(not close(given, all_steps), "Leave the steps where chunks meet out of the second mean.")
         late = np.arange(steps - 1) % plan == 0
-        expect(not close(given, _over(np.abs(change), late)), "One step off: a new plan begins with its first action.")
-        expect(close(given, right), "Change k leads from action k to k + 1; plans meet where k + 1 is a multiple.")
+        expect(not close(given, _over(np.abs(change), late)), "Off by one: a new chunk starts with its first action.")
+        expect(close(given, right), "Change k is from action k to k + 1; chunks meet where k + 1 is a multiple.")
 
 
 def _over(change: np.ndarray, chosen: np.ndarray) -> float:
@@ -79,33 +82,35 @@ def _over(change: np.ndarray, chosen: np.ndarray) -> float:
 
 
 def misled(share: Callable[[np.ndarray, np.ndarray], float]) -> None:
-    """``share(loss, success)``: of pairs that differ in success, how many does the loss rank the wrong way?"""
+    """``share(loss, success)``: the share of pairs that differ in success which the loss ranks the wrong way."""
     loss, success = np.array([0.5, 0.4, 0.3, 0.2]), np.array([0.0, 0.3, 0.3, 0.2])
     given = share(loss, success)
     expect(not close(given, 2 / 6), "Two models with the same success cannot be ranked: leave that pair out.")
     expect(not close(given, 3 / 5), "You count where the loss is right; a lower loss should mean more success.")
     expect(not close(given, 1 / 2), "Compare each checkpoint with all others, not with the next one only.")
     expect(not close(given, 2), "That is a count: divide by the number of pairs that differ in success.")
-    expect(close(given, 2 / 5), "List the pairs: 5 differ in success, and in 2 of them the lower loss is the worse.")
+    expect(close(given, 2 / 5), "List the pairs: 5 differ in success, and in 2 of them the lower loss is worse.")
     rising = np.arange(6.0)
     expect(close(share(rising, rising), 1.0), "If success always rises with the loss, every pair is misleading.")
     expect(close(share(rising, -rising), 0.0), "If success always falls with the loss, no pair is misleading.")
 
 
 def visible(difference: Callable[[int, float], float]) -> None:
-    """``difference(attempts, rate)`` is what that many attempts of each model show in 80 % of experiments."""
-    for attempts, rate in ((50, 0.6), (400, 0.7), (30, 0.5)):
-        given, right = difference(attempts, rate), _visible(attempts, rate, 0.8)
-        half = _visible(attempts, rate, 0.5)
-        expect(not close(given, half, 2e-3), "Such a difference is seen in half of the experiments: add z for 80 %.")
-        one = (norm.ppf(0.975) + norm.ppf(0.8)) * np.sqrt(rate * (1 - rate) / attempts)
-        expect(not close(given, one, 2e-3), "Both models are measured: their two variances add up.")
+    """``difference(rollouts, rate)`` is the difference that many rollouts per model detect in 80 % of experiments."""
+    for rollouts, rate in ((50, 0.6), (400, 0.7), (30, 0.5)):
+        given, right = difference(rollouts, rate), _visible(rollouts, rate, 0.8)
+        half = _visible(rollouts, rate, 0.5)
+        expect(
+            not close(given, half, 2e-3), "Such a difference is detected in half of the experiments: add z for 80 %."
+        )
+        one = (norm.ppf(0.975) + norm.ppf(0.8)) * np.sqrt(rate * (1 - rate) / rollouts)
+        expect(not close(given, one, 2e-3), "Both models are measured: their variances add up.")
         same = np.sqrt(2) * one
         expect(not close(given, same, 2e-3), "The better model has a variance of its own, from its own rate.")
-        expect(close(given, right, 2e-3), f"For {attempts} attempts at rate {rate} the formula says {right:.3f}.")
+        expect(close(given, right, 2e-3), f"For {rollouts} rollouts at rate {rate} the formula says {right:.3f}.")
 
 
-def _visible(attempts: int, rate: float, power: float) -> float:
-    """Solve attempts d² = z² (p(1 - p) + (p + d)(1 - p - d)), the sample size formula, for d."""
+def _visible(rollouts: int, rate: float, power: float) -> float:
+    """Solve rollouts d² = z² (p(1 - p) + (p + d)(1 - p - d)), the sample size formula, for d."""
     square = (norm.ppf(0.975) + norm.ppf(power)) ** 2
-    return max(np.roots([attempts + square, -square * (1 - 2 * rate), -2 * square * rate * (1 - rate)]).real)
+    return max(np.roots([rollouts + square, -square * (1 - 2 * rate), -2 * square * rate * (1 - rate)]).real)

@@ -13,15 +13,24 @@ State = dict[str, Any]
 
 
 def protects(answer: Mapping[str, str]) -> None:
-    """A dictionary from each threat to what keeps it off: ``tls``, ``keys`` or ``neither``."""
+    """A dictionary from each threat to what prevents it: ``tls``, ``keys`` or ``neither``."""
     asked = {
-        "listener": ("tls", "A listener is shut out by encryption: which of the two encrypts?"),
-        "false server": ("tls", "A client wants to know who the server is: which of the two has it prove that?"),
-        "stranger": ("keys", "Anybody may connect to a server with a certificate: who asks the stranger for a proof?"),
-        "bad member": ("neither", "A member has a good key and an encrypted line, and sends over it what it likes."),
-        "curious server": ("neither", "The server is the one that weights are sent to, so it can read them."),
+        "listener": ("tls", "Encryption stops a listener: which of the two encrypts?"),
+        "false server": (
+            "tls",
+            "A client must verify the server: which of the two makes the server prove its identity?",
+        ),
+        "stranger": (
+            "keys",
+            "Anyone may connect to a server with a certificate: which of the two asks the client for a proof?",
+        ),
+        "bad member": (
+            "neither",
+            "A member has a valid key and an encrypted connection, and can send anything over it.",
+        ),
+        "curious server": ("neither", "Weights are sent to the server, so it can read them."),
     }
-    expect(isinstance(answer, Mapping), "A dictionary is wanted, from each threat to its answer.")
+    expect(isinstance(answer, Mapping), "Return a dictionary, from each threat to its answer.")
     expect(set(answer) == set(asked), f"Its keys are the threats: {', '.join(asked)}.")
     words = {str(word).lower() for word in answer.values()}
     expect(words <= {"tls", "keys", "neither"}, "Each answer is one of tls, keys and neither.")
@@ -33,23 +42,23 @@ def round_cost(cost: Callable[[int, float, float, float, float], tuple[float, fl
     """``cost(clients, megabytes, client_mbit_s, server_mbit_s, dollars_per_gb)`` is seconds and dollars of a round."""
     for clients, megabytes, own, shared in [(10, 400.0, 20.0, 10_000.0), (5_000, 40.0, 50.0, 10_000.0)]:
         given = cost(clients, megabytes, own, shared, 0.09)
-        expect(np.shape(given) == (2,), "Return two numbers: the seconds on the line, and the dollars.")
+        expect(np.shape(given) == (2,), "Return two numbers: the seconds of transfer, and the dollars.")
         seconds, dollars = map(float, given)
         by_client, by_server = megabytes * 8 / own, clients * megabytes * 8 / shared
         line, gigabytes = max(by_client, by_server), clients * megabytes / 1000
         expect(not close(seconds * 8, 2 * line), "Eight times too fast: a megabyte has eight megabits.")
-        expect(not close(seconds, line), "The model travels twice in a round: down, and up again.")
+        expect(not close(seconds, line), "The model is sent twice in a round: down, and up again.")
         added, alone = close(seconds, 2 * (by_client + by_server)), close(seconds, 2 * by_client)
-        expect(not added, "The two lines are used at the same time: the slower one decides, not the sum.")
+        expect(not added, "Both lines are used at the same time: the slower one decides, not the sum.")
         expect(by_server < by_client or not alone, "All clients share the server's line: with many of them it decides.")
-        expect(close(seconds, 2 * line), "Each way takes as long as the slower line does, a client's or the server's.")
+        expect(close(seconds, 2 * line), "Each direction takes as long as the slower line, a client's or the server's.")
         billed_twice = close(dollars, 2 * gigabytes * 0.09)
-        expect(not billed_twice, "What arrives at the server is free; only the way down is billed.")
-        expect(close(dollars, gigabytes * 0.09), "Dollars: the gigabytes that leave the server, a model a client.")
+        expect(not billed_twice, "Uploads to the server are free; only downloads are billed.")
+        expect(close(dollars, gigabytes * 0.09), "Dollars: the gigabytes that leave the server, one model per client.")
 
 
 def average(mean: Callable[[Sequence[tuple[int, int, np.ndarray]]], np.ndarray]) -> None:
-    """``mean(replies)`` is the average of (partition, frames, array) with the same bits in whatever order they come."""
+    """``mean(replies)`` is the average of (partition, frames, array), bit-identical for any order."""
     rng = np.random.default_rng(9)
     frames = [40, 40, 25, 60, 60, 15, 33]
     replies = [(k, n, rng.normal(0, 1 + k, 500).astype(np.float32)) for k, n in enumerate(frames)]
@@ -58,14 +67,14 @@ def average(mean: Callable[[Sequence[tuple[int, int, np.ndarray]]], np.ndarray])
     given = [np.asarray(mean([copy.deepcopy(replies[k]) for k in order])) for order in orders]
     right = np.average(arrays.astype(float), axis=0, weights=frames)
     expect(given[0].shape == (500,), f"An average has the shape of one array, (500,), not {given[0].shape}.")
-    expect(not close(given[0], arrays.mean(axis=0), 1e-4), "A client with more frames has to weigh more.")
-    expect(close(given[0], right, 1e-4), "The mean of the arrays, each weighted by its share of all frames, is wanted.")
+    expect(not close(given[0], arrays.mean(axis=0), 1e-4), "A client with more frames must weigh more.")
+    expect(close(given[0], right, 1e-4), "Return the mean of the arrays, each weighted by its share of all frames.")
     alike = all(other.tobytes() == given[0].tobytes() for other in given)
-    expect(alike, "The last bits depend on who answered first: put the replies into a fixed order before you sum.")
+    expect(alike, "The last bits depend on who answered first: sort the replies before you sum.")
 
 
 def bytes_by_round(read: Callable[[Sequence[str]], dict[int, int]]) -> None:
-    """``read(lines)`` is the bytes both ways of each round, from the lines of a metrics.jsonl."""
+    """``read(lines)`` is the bytes of each round in both directions, from the lines of a metrics.jsonl."""
     for rounds, cut in [(3, True), (2, False)]:
         events, right = [], {}
         for number in range(1, rounds + 1):
@@ -76,18 +85,18 @@ def bytes_by_round(read: Callable[[Sequence[str]], dict[int, int]]) -> None:
             right[number] = 1_250 * number + 625
         lines = [json.dumps(event) for event in events]
         given = read([*lines, lines[-1][:70]] if cut else lines)
-        expect(isinstance(given, Mapping), "A dictionary is wanted, from the number of a round to its bytes.")
-        expect(set(given) == set(right), f"Here are the rounds {', '.join(map(str, right))}, as whole numbers.")
+        expect(isinstance(given, Mapping), "Return a dictionary, from the number of a round to its bytes.")
+        expect(set(given) == set(right), f"Expected the rounds {', '.join(map(str, right))}, as whole numbers.")
         found = list(map(given.get, right))
         sent, training = [1_000 * n + 500 for n in right], [1_250 * n for n in right]
         expect(not close(found, sent), "Those bytes were sent; what was received counts as well.")
-        expect(not close(found, training), "Evaluation sends the model round once more: count it as well.")
-        expect(not close(found, [625] * rounds), "A round has two such events: you keep the last instead of the sum.")
+        expect(not close(found, training), "Evaluation sends the model once more: count it as well.")
+        expect(not close(found, [625] * rounds), "A round has two such events: you keep the last instead of their sum.")
         expect(close(found, list(right.values())), "Add sent_bytes and received_bytes of each event of kind replies.")
 
 
 def clipped(shorten: Callable[[np.ndarray, float], np.ndarray]) -> None:
-    """``shorten(moves, limit)`` is the movements (clients, numbers), none longer than the limit."""
+    """``shorten(moves, limit)`` is the updates (clients, numbers), none with a norm above the limit."""
     rng = np.random.default_rng(10)
     headings = rng.normal(size=(5, 8))
     headings /= np.linalg.norm(headings, axis=1, keepdims=True)
@@ -95,28 +104,31 @@ def clipped(shorten: Callable[[np.ndarray, float], np.ndarray]) -> None:
     moves = headings * lengths[:, None]
     with np.errstate(all="ignore"):
         given = shorten(moves.copy(), limit)
-    expect(np.shape(given) == (5, 8), f"All 5 movements of 8 numbers are wanted, not the shape {np.shape(given)}.")
-    expect(not np.isnan(given).any(), "A client that did not move has length 0; dividing by it gives no number.")
-    expect(not close(given, np.clip(moves, -limit, limit)), "You cut number by number, which turns a movement.")
-    expect(not close(given[:4], headings[:4] * limit), "A movement below the limit stays as it is; you lengthen it.")
+    expect(np.shape(given) == (5, 8), f"Expected all 5 updates of 8 numbers, not the shape {np.shape(given)}.")
+    expect(not np.isnan(given).any(), "An update of 0 has norm 0; dividing by it gives NaN.")
+    expect(
+        not close(given, np.clip(moves, -limit, limit)),
+        "You clip number by number, which changes the direction of an update.",
+    )
+    expect(not close(given[:4], headings[:4] * limit), "An update below the limit stays as it is; you lengthen it.")
     whole = moves * min(1.0, limit / np.linalg.norm(moves))
     common = close(given, moves * limit / lengths.max()) or close(given, whole)
-    expect(not common, "One client's length shortens all others: each client has its own factor.")
+    expect(not common, "One client's norm shortens all others: each client has its own factor.")
     left_out = close(given, moves * (lengths <= limit)[:, None])
-    expect(not left_out, "A movement above the limit is shortened to it, not left out.")
+    expect(not left_out, "An update above the limit is shortened to it, not left out.")
     right = headings * np.minimum(lengths, limit)[:, None]
-    expect(close(given, right), "Keep the direction of each movement; its length is at most the limit.")
+    expect(close(given, right), "Keep the direction of each update; its norm is at most the limit.")
 
 
 def advance(play: Callable[[State, int, Sequence[float], int], State]) -> None:
-    """``play(state, until, wishes, seed)`` plays the rounds that are missing; a resumed run ends in the same bits."""
+    """``play(state, until, wishes, seed)`` plays the missing rounds; a resumed run ends with the same bits."""
     start, wishes = {"round": 0, "w": 0.0}, [-1.0, 2.0, 6.0]
     one = [_w(play, start, until, [3.0], 0) for until in range(9)]
     part = play(dict(start), 3, [3.0], 0)
     resumed = play(copy.deepcopy(part), 8, [3.0], 0)
     counted = isinstance(resumed, Mapping) and resumed.get("round") == 8
-    expect(counted, "Rounds that are done count: go on from state['round'] until `until`, and note where you are.")
-    lost = "With one client nothing is drawn, yet a resumed run ends elsewhere: more rounds, or something forgotten?"
+    expect(counted, "Completed rounds count: continue from state['round'] to `until`, and store the round.")
+    lost = "With one client there is no sampling, yet a resumed run differs: a forgotten part of the state?"
     expect(resumed["w"] == one[8], lost)
     right, m = [0.0], 0.0
     for _ in range(8):
@@ -124,18 +136,18 @@ def advance(play: Callable[[State, int, Sequence[float], int], State]) -> None:
         right.append(right[-1] + m)
     expect(close(one, right), "With one client, u = 0.1 (wish - w), then m = m / 2 + u, then w = w + m, from m = 0.")
     path = [_w(play, start, until, wishes, 1) for until in range(31)]
-    expect(path[30] == _w(play, start, 30, wishes, 1), "Played twice, the same seed gives two results.")
+    expect(path[30] == _w(play, start, 30, wishes, 1), "Two runs with the same seed differ.")
     drawn = [_drawn(path, number, wishes) for number in range(30)]
-    expect(None not in drawn, "In each round one client is drawn, and only its wish moves the server.")
-    expect(set(drawn) == {0, 1, 2}, "Over many rounds every client has to be drawn; here some never are.")
-    expect(path[8] != _w(play, start, 8, wishes, 2), "Another seed has to draw other clients.")
+    expect(None not in drawn, "In each round one client is sampled, and only its wish moves the server.")
+    expect(set(drawn) == {0, 1, 2}, "Over many rounds every client must be sampled; here some never are.")
+    expect(path[8] != _w(play, start, 8, wishes, 2), "Another seed must sample other clients.")
     for cut in range(1, 8):
         part = play(dict(start), cut, wishes, 1)
         kept = copy.deepcopy({key: part[key] for key in ("round", "w")})
         twice = [_w(play, part, 8, wishes, 1) for _ in range(2)]
         same = all(part[key] == value for key, value in kept.items()) and twice[0] == twice[1]
-        expect(same, "Going on changes the state it starts from: a checkpoint has to stay as it was written.")
-        expect(twice[0] == path[8], "A resumed run draws other clients: let draws depend on seed and round only.")
+        expect(same, "Resuming changes the state it starts from: a checkpoint must stay as it was written.")
+        expect(twice[0] == path[8], "A resumed run samples other clients: sampling must depend on seed and round only.")
 
 
 def _event(number: int, who: str, kind: str, **values: Any) -> dict[str, Any]:
