@@ -167,7 +167,7 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
 @pytest.mark.integration
 def test_a_cell_whose_clients_failed_is_stamped_with_the_steps_that_were_taken(recording, tmp_path, monkeypatch):
     """In round 1 client 0 fails, in round 2 client 1 is rejected: half of what the settings ask for is averaged."""
-    monkeypatch.setattr(methods.engine, "run_inline", partial(inline.run_inline, clients_app=faulty.app))
+    monkeypatch.setattr(methods.inline, "run_inline", partial(inline.run_inline, clients_app=faulty.app))
     settings = {"tasks": "lift", "data": str(recording), "num_clients": 2, "num_server_rounds": 2, "local_steps": 3}
     config = from_profile("tiny", **QUIET, **settings)
     cell = Cell("averaged", "federated", "mixed", 0, config)
@@ -264,8 +264,8 @@ def test_a_wrong_choice_of_statistics_changes_the_model_or_how_it_acts(choice, r
 def test_differences_use_the_seeds_that_both_methods_have_and_are_corrected_together():
     rng = np.random.default_rng(0)
     lines = [
-        {"partition": partition, "method": method, "run": run, "task": "lift", "seed": seed, "loss": 0.1 * rate + 0.01 * run,
-         "action_error": 10 * (1 - rate), "success": rng.random() < rate}
+        {"partition": partition, "method": method, "run": run, "task": "lift", "seed": seed,
+         "loss": 0.1 * rate + 0.01 * run, "action_error": 10 * (1 - rate), "success": rng.random() < rate}
         for partition in ("iid", "task") for method, rate in (("pooled", 0.9), ("shared", 0.5)) for run in range(4)
         for seed in range(40) if not (method == "shared" and run == 3)
     ]  # fmt: skip

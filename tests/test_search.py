@@ -1,4 +1,4 @@
-"""The search spends what it says, goes on where it stopped, and judges on what did not choose."""
+"""The search keeps its budget, resumes, and reports on data that selected nothing."""
 
 import json
 from dataclasses import asdict, replace
@@ -13,7 +13,6 @@ from fedvla_lib.data import recordings, splits
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.statistics import wilson
 from fedvla_lib.experiments import methods, search
-from fedvla_lib.federation import client
 from fedvla_lib.federation.strategies.build import SERVER_LR
 
 
@@ -33,20 +32,20 @@ def test_every_trial_has_the_same_budget(strategy):
 
 
 @pytest.fixture
-def judged(monkeypatch):
-    """The episodes behind each loss that the search looks at, in order."""
-    episodes, validate = [], measure.measure_held_out
+def evaluated(monkeypatch):
+    """The episodes behind each loss that the search computes, in order."""
+    episodes, held_out_frames = [], measure.held_out_frames
 
-    def noting(bundle, store, episode_ids, config):
+    def recording_ids(bundle, store, episode_ids, config):
         episodes.append(list(episode_ids))
-        return validate(bundle, store, episode_ids, config)
+        return held_out_frames(bundle, store, episode_ids, config)
 
-    monkeypatch.setattr(client, "validate", noting)
+    monkeypatch.setattr(measure, "held_out_frames", recording_ids)
     return episodes
 
 
 @pytest.mark.integration
-def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, capsys, judged):
+def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, capsys, evaluated):
     command = ["search", "--profile", "tiny", "--data", str(recording), "--tasks", "lift,push", "--num-clients", "2"]
     out = tmp_path / "fedavg"
     command += ["--val-fraction", "0.5", "--rollouts", "1", "--search-out", str(out)]
@@ -68,7 +67,7 @@ def test_a_search_goes_on_and_reports_on_other_episodes(recording, tmp_path, cap
     store = recordings.open_frames(config)
     held_out, shares = splits.held_out_episodes(store, config), splits.shares(store, config)
     trial, start, best = held_out[0::2], held_out[1::2], held_out[1::2]
-    assert judged == [trial, start, best, trial, start, best]  # of the first call, and of the one that went on
+    assert evaluated == [trial, start, best, trial, start, best]  # of the first call, and of the one that went on
     assert trial and not set(trial) & set(best)
     assert not set(held_out) & {episode for share in shares for episode in share.train_ids}
     assert main([*command, "--trials", "2", "--lr", "0.01"]) == 2

@@ -26,7 +26,7 @@ def good_average(average: Callable[..., np.ndarray]) -> None:
 
 
 def rounds_within(count: Callable[..., int]) -> None:
-    """``count(budget_mb, parameters, trainers, evaluators)``: complete rounds whose messages fit (float32, both ways)."""
+    """``count(budget_mb, parameters, trainers, evaluators)``: complete rounds whose messages fit (float32)."""
     given = count(170, 500_000, 4, 10)
     expect(given != 10, "A client that evaluates receives the weights as well: count that download.")
     expect(given != 3, "A client that evaluates sends numbers back, no weights: do not count an upload.")
