@@ -206,7 +206,8 @@ def _num_episodes(root: Path) -> int:
 
 @pytest.mark.unit
 def test_no_heavy_package_is_loaded_for_help_and_settings():
-    code = "import sys; from fedvla_lib.cli import main; main.main(['config']); print(sorted(sys.modules), file=sys.stderr)"
+    script = "from fedvla_lib.cli.main import main; main(['config'])"
+    code = f"import sys; {script}; print(sorted(sys.modules), file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(re.findall(r"'(\w+)'", done.stderr))
     assert not loaded & {"torch", "lerobot", "flwr", "mujoco", "matplotlib", "pandas"}

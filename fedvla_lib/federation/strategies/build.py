@@ -13,8 +13,8 @@ from fedvla_lib.federation.strategies.fedyogi import CheckedFedYogi
 from fedvla_lib.federation.strategies.krum import CheckedKrum
 from fedvla_lib.federation.strategies.scaffold import CheckedScaffold
 
-# Default server learning rates for pretrained weights. Flower's 0.1 can change each weight by 0.1 in a round, which is the
-# size of the weights themselves.
+# Default server learning rates for pretrained weights. With Flower's 0.1, a round can change each weight by 0.1,
+# which is as much as the weights themselves.
 SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01}
 ADAPTIVITY = 1e-3  # tau: added to the root of the second moment
 
