@@ -15,10 +15,11 @@ from dataclasses import replace
 
 import pandas as pd
 
+from fedvla_book.tables.grids import paired_difference
 from fedvla_lib.config import Config, task_names
 from fedvla_lib.data import recordings
 from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
-from fedvla_lib.evaluation.statistics import paired_difference, success_table
+from fedvla_lib.evaluation.statistics import success_table
 from fedvla_lib.experiments import methods
 from fedvla_lib.files import write_json
 from fedvla_lib.policy.actor import PolicyActor

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from fedvla_book import tables
+from fedvla_book.tables import grids
 from fedvla_lib.evaluation import statistics
 
 pytestmark = pytest.mark.unit
@@ -69,7 +70,7 @@ def test_success_table_counts_per_group():
 
 def test_mcnemar_equals_the_exact_binomial():
     left, right = [1] * 9 + [0] * 3 + [1] * 5, [0] * 9 + [1] * 3 + [1] * 5
-    result = statistics.paired_difference(rows(a=left, b=right), "a", "b", seed=0)
+    result = grids.paired_difference(rows(a=left, b=right), "a", "b", seed=0)
     tail = sum(comb(12, k) for k in range(4)) / 2**12
     assert result["p_value"] == pytest.approx(2 * tail)
     assert (result["only_method"], result["only_other"], result["n"]) == (9, 3, 17)
@@ -113,17 +114,17 @@ def test_the_interval_of_a_loss_or_of_its_difference_covers_the_truth(draw, trut
 
 
 def test_equal_methods_show_no_difference():
-    result = statistics.paired_difference(rows(a=[1, 0, 1], b=[1, 0, 1]), "a", "b", seed=0)
+    result = grids.paired_difference(rows(a=[1, 0, 1], b=[1, 0, 1]), "a", "b", seed=0)
     assert (result["difference"], result["low"], result["high"], result["p_value"]) == (0, 0, 0, 1)
 
 
 def test_unpaired_rollouts_are_refused():
     with pytest.raises(ValueError, match="unknown method 'c': choose one of a, b"):
-        statistics.paired(rows(a=[1], b=[1]), "a", "c")
+        grids.paired(rows(a=[1], b=[1]), "a", "c")
     with pytest.raises(ValueError, match="did not run the same rollouts"):
-        statistics.paired(rows(a=[1, 0], b=[1]), "a", "b")
+        grids.paired(rows(a=[1, 0], b=[1]), "a", "b")
     with pytest.raises(ValueError, match="twice"):
-        statistics.paired(pd.concat([rows(a=[1]), rows(a=[1], b=[1])]), "a", "b")
+        grids.paired(pd.concat([rows(a=[1]), rows(a=[1], b=[1])]), "a", "b")
 
 
 def test_mean_difference_equals_the_enumeration_of_all_signs():
@@ -231,7 +232,7 @@ def test_intervals_over_seeds_and_rollouts_cover_the_truth_as_often_as_they_say(
         found = statistics.over_seeds(pd.DataFrame(left.astype(float), columns=columns))
         covered["rate"].append(found["low"] <= rates[0] <= found["high"])
         if k % 4 == 0:
-            low, high = statistics.crossed_bootstrap(difference, seed=k, resamples=400)
+            low, high = grids.crossed_bootstrap(difference, seed=k, resamples=400)
             covered["bootstrap"].append(low <= rates[0] - rates[1] <= high)
     share = {name: np.mean(each) for name, each in covered.items()}
     assert 0.93 <= share["difference"] <= 0.97 and 0.93 <= share["rate"] <= 0.97
@@ -245,12 +246,12 @@ def test_methods_are_paired_by_training_seed_and_rollout():
         for method, each in methods.items() for run, outcome in enumerate(each) for seed, ok in enumerate(outcome)
     ]  # fmt: skip
     table = pd.DataFrame(lines)
-    found = statistics.difference_over_seeds(table, "a", "b", seed=0)
+    found = grids.difference_over_seeds(table, "a", "b", seed=0)
     assert found["difference"] == pytest.approx(0.25) and (found["only_left"], found["only_right"]) == (2, 0)
     assert found["mcnemar_p"] == pytest.approx(0.5) and found["low"] < 0.25 < found["high"]
     assert found["boot_low"] <= 0.25 <= found["boot_high"]
     with pytest.raises(ValueError, match="cannot be paired"):
-        statistics.difference_over_seeds(table.drop(index=[3, 7]), "a", "b", seed=0)
+        grids.difference_over_seeds(table.drop(index=[3, 7]), "a", "b", seed=0)
     with pytest.raises(ValueError, match="lack rollouts"):
         statistics.by_run(table[table.method == "a"].drop(index=3))
     with pytest.raises(ValueError, match="twice"):
@@ -259,7 +260,7 @@ def test_methods_are_paired_by_training_seed_and_rollout():
 
 def test_the_crossed_bootstrap_is_as_wide_as_the_spread_of_seeds_when_only_they_differ():
     each = np.array([0.0, 0.2, 0.4, 0.6, 0.8])
-    low, high = statistics.crossed_bootstrap(outcomes(np.repeat(each[:, None], 10, axis=1)), seed=0, resamples=20_000)
+    low, high = grids.crossed_bootstrap(outcomes(np.repeat(each[:, None], 10, axis=1)), seed=0, resamples=20_000)
     draws = np.random.default_rng(1).choice(each, (20_000, 5)).mean(axis=1)
     assert (low, high) == pytest.approx(tuple(np.quantile(draws, [0.025, 0.975])), abs=0.021)
 
@@ -270,7 +271,7 @@ def test_the_order_in_which_rollouts_were_made_does_not_matter():
             for method in "ab" for run in (0, 1, 2) for seed in range(12)]  # fmt: skip
     table = pd.DataFrame(rows)
     dealt_out = pd.concat([table[table.method == "a"], table[table.method == "b"].sort_values("seed", ascending=False)])
-    there, here = (statistics.difference_over_seeds(of, "a", "b", seed=0) for of in (table, dealt_out))
+    there, here = (grids.difference_over_seeds(of, "a", "b", seed=0) for of in (table, dealt_out))
     assert there == here
 
 

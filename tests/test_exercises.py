@@ -26,7 +26,7 @@ def met(notebook):
     cells = nbformat.read(notebook, as_version=4).cells
     for before, cell, after in zip(cells, cells[1:], cells[2:], strict=False):
         if "exercise" in cell.metadata.get("tags", []):
-            (chapter, name, _), = CHECK.findall(cell.source)
+            ((chapter, name, _),) = CHECK.findall(cell.source)
             found = SOLUTION.search(after.source)
             assert found, f"{chapter}.{name}: no solution folds out below it"
             yield chapter, name, before.source, CHECK.sub("", cell.source), found[1]

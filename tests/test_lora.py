@@ -7,12 +7,12 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from fedvla_book import tables
+from fedvla_book import full_size, tables
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import recordings, splits
 from fedvla_lib.data.batches import Batches
 from fedvla_lib.evaluation import held_out
-from fedvla_lib.policy import actor, full_size, lora, model, training
+from fedvla_lib.policy import actor, lora, model, training
 from fedvla_lib.policy.parameters import trainable_arrays
 
 pytestmark = pytest.mark.integration

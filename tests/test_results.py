@@ -175,7 +175,8 @@ def test_labs_alone_are_held_against_the_federation_on_the_very_rollouts_at_thei
 
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):
-    known = {"method": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1, "samples": 1,
+    known = {"method": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1,
+             "samples": 1,
              "bytes": 0, "train_s": None}  # fmt: skip
     (tmp_path / "task_pooled_0").mkdir()
     (tmp_path / "task_pooled_0" / "stamp.json").write_text(json.dumps(known))

@@ -74,7 +74,7 @@ def test_resume_is_bit_exact_even_after_a_crash(tmp_path):
 @pytest.mark.unit
 def test_steps_are_those_that_were_done_not_those_that_were_asked_for(tmp_path):
     run(6, checkpoints=Checkpoints(tmp_path))
-    _, again = run(4, checkpoints=Checkpoints(tmp_path, resume=True))  # the newest checkpoint lies behind what is asked for
+    _, again = run(4, checkpoints=Checkpoints(tmp_path, resume=True))  # its newest checkpoint is at step 6
     assert again.steps == len(again.losses) == 6
 
 

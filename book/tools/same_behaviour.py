@@ -32,7 +32,7 @@ partition = "task"
 )
 RUN = ["--profile", "tiny", "--seed", "3"]
 COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the folder of command X
-    "record": ["record", "--profile", "tiny", "--task", "lift", "--task", "push", "--episodes", "2", "--out", "{D}/data"],
+    "record": ["record", "--profile", "tiny", "--task", "lift", "--episodes", "3", "--out", "{D}/data"],
     "inline": ["run", *RUN, "--out", "{D}"],
     "simulation": ["run", *RUN, "--engine", "simulation", "--out", "{D}"],
     "deployment": ["deploy", *RUN, "--tls", "--auth", "--out", "{D}"],
@@ -52,10 +52,13 @@ COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the fol
     "doctor": ["doctor"],
     "wrong": ["run", "--profile", "tiny", "--partition", "alphabet"],
     "help": ["--help"],
-} | {f"{name} --help": [name, "--help"] for name in ("record", "pretrain", "experts", "config", "train", "run", "deploy",
-     "superlink", "credentials", "evaluate", "experiment", "search", "compare", "videos", "doctor")}  # fmt: skip
+}
+HELPED = ("record", "pretrain", "experts", "config", "train", "run", "deploy", "superlink", "credentials", "evaluate",
+          "experiment", "search", "compare", "videos", "doctor")  # fmt: skip
+COMMANDS |= {f"{name} --help": [name, "--help"] for name in HELPED}
 MASKS = [
-    (r"(?<!\d)\d{8}_\d{6}(_\d{6})?(?!\d)", "TIME"), (r"\b\d+(\.\d+)? (s|seconds|GiB|MB)\b", "N \\2"), (r"\d+%\|.*", "BAR"),
+    (r"(?<!\d)\d{8}_\d{6}(_\d{6})?(?!\d)", "TIME"), (r"\b\d+(\.\d+)? (s|seconds|GiB|MB)\b", "N \\2"),
+    (r"\d+%\|.*", "BAR"),
     (r"process \d+", "process N"), (r"127\.0\.0\.1:\d+", "ADDRESS"), (r" +", " "),
 ]  # fmt: skip
 FLEETING = {

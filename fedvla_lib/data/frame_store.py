@@ -105,13 +105,10 @@ def _build(dataset: ReadDataset, image_size: int, folder: Path, progress: bool) 
 def _load(root: Path, folder: Path) -> FrameStore:
     content = json.loads((folder / "store.json").read_text())
     return FrameStore(
-        root=root,
-        fps=content["fps"],
-        states=np.load(folder / "states.npy"),
-        actions=np.load(folder / "actions.npy"),
+        root=root, fps=content["fps"], states=np.load(folder / "states.npy"), actions=np.load(folder / "actions.npy"),
         images={camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in content["cameras"]},
         episodes=pd.DataFrame(json.loads((folder / "episodes.json").read_text())),
-    )
+    )  # fmt: skip
 
 
 def _fingerprint(root: Path, image_size: int, cameras: Mapping[str, str] | None) -> str:

@@ -47,13 +47,11 @@ def record(
 
     Args:
         tasks: names from `robot.tasks.ALL_TASKS`, in the order in which they alternate.
-        episodes_per_task: demonstrations of each task.
         root: folder to write; a second process recording into it waits for the first.
         image_size: side of the square camera images in pixels, even.
         seed: fixes every episode.
         num_labs: labs to record in, in turn; with more than one, the column ``lab_index`` holds the lab.
         jitter: above 0, cameras, light and colours are drawn for every episode, with this spread.
-        progress: show a progress bar.
 
     Raises:
         ValueError: unknown task, unusable size, a folder that is not a recording or has other settings.

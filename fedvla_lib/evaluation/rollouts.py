@@ -87,14 +87,11 @@ def _lab(labs: Sequence[Lab], seed: int) -> Lab:
 def row(episode: Episode) -> dict[str, Any]:
     """Return the row of one rollout, see `evaluate`."""
     return {
-        "task": episode.task,
-        "instruction": episode.instruction,
-        "seed": episode.seed,
-        "success": bool(episode.success),
-        "steps": episode.num_frames,
+        "task": episode.task, "instruction": episode.instruction, "seed": episode.seed,
+        "success": bool(episode.success), "steps": episode.num_frames,
         "completion_time_s": episode.num_frames / FPS if episode.success else float("nan"),
         "action_smoothness": smoothness(episode.actions),
-    }
+    }  # fmt: skip
 
 
 def smoothness(actions: np.ndarray) -> float:

@@ -50,39 +50,6 @@ def success_table(rows: pd.DataFrame, by: Sequence[str], confidence: float = CON
     return table
 
 
-def paired(rows: pd.DataFrame, method: str, other: str) -> pd.DataFrame:
-    """Pair the rollouts of two methods: one row per (task, seed) with both outcomes.
-
-    Raises:
-        ValueError: unknown method, or the methods did not run the same tasks and seeds.
-    """
-    known = sorted(rows.method.unique())
-    for name in (method, other):
-        if name not in known:
-            raise ValueError(f"unknown method {name!r}: choose one of {', '.join(known)}")
-    outcomes = rows.set_index(["task", "seed"]).success.astype(bool)
-    left, right = (outcomes[(rows.method == name).to_numpy()] for name in (method, other))
-    if left.index.has_duplicates or right.index.has_duplicates:
-        raise ValueError(f"{method!r} or {other!r} ran a (task, seed) twice: pairs must be unique")
-    if set(left.index) != set(right.index):
-        odd = sorted(set(left.index) ^ set(right.index))[0]
-        raise ValueError(f"{method!r} and {other!r} did not run the same rollouts: {odd} is in one only")
-    return pd.DataFrame({method: left, other: right.loc[left.index]})
-
-
-def paired_difference(
-    rows: pd.DataFrame, method: str, other: str, *, seed: int, confidence: float = CONFIDENCE
-) -> dict[str, Any]:
-    """Return `success_difference` of `method` - `other` over the same rollouts, with the names of both.
-
-    `only_method` and `only_other` count the rollouts that only one of them solved.
-    """
-    outcomes = paired(rows, method, other)
-    found = success_difference(outcomes[method], outcomes[other], seed=seed, confidence=confidence)
-    named = {"only_left": "only_method", "only_right": "only_other"}
-    return {"method": method, "other": other, **{named.get(key, key): value for key, value in found.items()}}
-
-
 def success_difference(
     left: Sequence[bool], right: Sequence[bool], *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
@@ -215,30 +182,6 @@ def success_interval(rows: pd.DataFrame, confidence: float = CONFIDENCE) -> tupl
     return max(found["low"], 0.0), min(found["high"], 1.0)
 
 
-def difference_over_seeds(
-    rows: pd.DataFrame, method: str, other: str, *, seed: int, confidence: float = CONFIDENCE
-) -> dict[str, Any]:
-    """Difference in success rate `method` - `other`, paired by training seed and rollout.
-
-    Returns:
-        `over_seeds` of the differences, which generalises to other training seeds and rollouts; boot_low, boot_high of
-        `crossed_bootstrap`; and for these models only: n, only_left, only_right (rollouts that only one method solved)
-        and McNemar's exact p-value (`mcnemar_p`).
-
-    Raises:
-        ValueError: the methods do not have the same training seeds and rollouts.
-    """
-    left, right = (by_run(rows[rows.method == name]) for name in (method, other))
-    if not (left.index.equals(right.index) and left.columns.equals(right.columns)):
-        raise ValueError(f"{method!r} and {other!r} differ in training seeds or rollouts: they cannot be paired")
-    pairs = success_difference(left.to_numpy().ravel(), right.to_numpy().ravel(), seed=seed, confidence=confidence)
-    low, high = crossed_bootstrap(left - right, seed=seed, confidence=confidence)
-    counts = {key: pairs[key] for key in ("n", "only_left", "only_right")}
-    found = over_seeds(left - right, confidence)
-    p_values = {"p_value": found.pop("p_value"), "mcnemar_p": pairs["p_value"]}
-    return {"method": method, "other": other, **found, "boot_low": low, "boot_high": high, **counts, **p_values}
-
-
 def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str, float]:
     """Mean of outcomes (or paired differences) with Student's interval over training seeds and rollouts.
 
@@ -284,26 +227,3 @@ def _mean_squares(values: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
         np.square(array - by_seed[:, None] - by_rollout + mean).sum(),
     ])  # fmt: skip
     return np.divide(squares, freedom, out=np.zeros(3), where=freedom > 0), freedom
-
-
-def crossed_bootstrap(
-    values: pd.DataFrame, *, seed: int, confidence: float = CONFIDENCE, resamples: int = 2000
-) -> tuple[float, float]:
-    """Percentile interval of the mean: resample training seeds, and rollouts within tasks, independently.
-
-    Its simulated coverage with 5 training seeds is 99 % where seeds are alike and falls to 93 % where they differ much,
-    so the book reports `over_seeds` and shows this next to it.
-
-    Source: the pigeonhole bootstrap, Owen 2007, doi 10.1214/07-AOAS122.
-    """
-    rng, array = np.random.default_rng(seed), values.to_numpy(float)
-    seeds, rollouts = array.shape
-    rows = rng.multinomial(seeds, np.full(seeds, 1 / seeds), resamples)
-    tasks = np.asarray(values.columns.get_level_values(0))
-    columns = np.zeros((resamples, rollouts), dtype=int)
-    for task in np.unique(tasks):
-        places = np.flatnonzero(tasks == task)
-        columns[:, places] = rng.multinomial(len(places), np.full(len(places), 1 / len(places)), resamples)
-    means = np.einsum("rs,sa,ra->r", rows, array, columns, optimize=True) / array.size
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(low), float(high)

@@ -73,16 +73,11 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         checkpoints=Checkpoints(work / "checkpoints", resume=True), progress=progress,
     )  # fmt: skip
     report = {
-        "recipe": asdict(recipe),
-        "episodes": len(episodes),
-        "frames": store.num_frames,
-        "parameters": sum(p.numel() for p in bundle.policy.parameters()),
-        "grounding": grounding,
-        "training_seconds": result.seconds,
-        "last_loss": sum(result.losses[-100:]) / len(result.losses[-100:]),
-        "success": measure(bundle, recipe, progress),
-        "language": follows_instructions(bundle, recipe, progress),
-    }
+        "recipe": asdict(recipe), "episodes": len(episodes), "frames": store.num_frames,
+        "parameters": sum(p.numel() for p in bundle.policy.parameters()), "grounding": grounding,
+        "training_seconds": result.seconds, "last_loss": float(np.mean(result.losses[-100:])),
+        "success": measure(bundle, recipe, progress), "language": follows_instructions(bundle, recipe, progress),
+    }  # fmt: skip
     report["stamp"] = stamp | {"status": "completed", "wall_s": time.perf_counter() - began}
     with new_folder(out.absolute()) as draft:
         model.write_policy(bundle, draft)

@@ -253,9 +253,6 @@ PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
     "sort": _sort_plan,
     "reach": lambda layout, start: [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cube_yaw_rad, OPEN)],
     "grip": lambda layout, start: _grasp(start, layout.cubes[0]),
-    "drag": _drag_plan,
-    "pull": _pull_plan,
-    "nudge": _nudge_plan,
-    "point_square": _point_plan,
+    "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan, "point_square": _point_plan,
     "point_circle": _point_plan,
-}
+}  # fmt: skip

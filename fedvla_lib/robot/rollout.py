@@ -113,12 +113,8 @@ class RunningEpisode:
     def result(self) -> Episode:
         sim = self.env.unwrapped
         return Episode(
-            task=sim.task,
-            instruction=sim.instruction,
-            color=sim.layout.color,
-            seed=self.seed,
+            task=sim.task, instruction=sim.instruction, color=sim.layout.color, seed=self.seed, success=self._success,
             states=np.stack([frame["agent_pos"] for frame in self._observations]).reshape(-1, NUM_JOINTS),
             actions=np.stack(self._actions),
             images={name: np.stack([frame["pixels"][name] for frame in self._observations]) for name in sim.cameras},
-            success=self._success,
-        )
+        )  # fmt: skip

@@ -214,20 +214,11 @@ class So100Env(gymnasium.Env):
         history.carried |= held and clearance_m > CARRY_CLEARANCE_M
         history.flung |= name not in touched_in_step and speed_mps > FLUNG_SPEED_MPS
         return TaskState(
-            clearance_m=clearance_m,
-            peak_clearance_m=history.peak_clearance_m,
-            speed_mps=speed_mps,
-            zone_offset_m=self._from_zone(index, cube_m),
-            held=held,
-            touched=bool(parts),
-            carried=history.carried,
-            flung=history.flung,
-            hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))),
-            cube_m=cube_m,
-            start_m=history.start_m,
-            hand_m=hand_m,
-            hand_zone_offset_m=self._from_zone(index, hand_m),
-        )
+            clearance_m=clearance_m, peak_clearance_m=history.peak_clearance_m, speed_mps=speed_mps,
+            zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts), carried=history.carried,
+            flung=history.flung, hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))), cube_m=cube_m,
+            start_m=history.start_m, hand_m=hand_m, hand_zone_offset_m=self._from_zone(index, hand_m),
+        )  # fmt: skip
 
     def _from_zone(self, index: int, point_m: tuple[float, float, float]) -> tuple[float, float]:
         """Offset (x, y) of a point from the centre of cube `index`'s zone."""

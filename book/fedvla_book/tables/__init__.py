@@ -12,8 +12,12 @@ from fedvla_book.tables.grids import (
     at_own_task,
     beside_own_tasks,
     by_steps,
+    crossed_bootstrap,
+    difference_over_seeds,
     differences,
     fill_in,
+    paired,
+    paired_difference,
     read_rounds,
     repeat_partition_free,
     unpaired_difference,
@@ -22,6 +26,10 @@ from fedvla_book.tables.model import averaging_error, module_table
 from fedvla_book.tables.searches import SEARCHED, compared, read_searches
 
 __all__ = [
+    "crossed_bootstrap",
+    "difference_over_seeds",
+    "paired",
+    "paired_difference",
     "OF_RUN",
     "OTHER",
     "OWN",
