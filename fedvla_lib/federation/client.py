@@ -21,6 +21,7 @@ from fedvla_lib.evaluation.measure import measure
 from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.policy import model, prefix_cache, training
 from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.model import Bundle
 from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.policy.training import Correction
 
@@ -35,7 +36,7 @@ class Loaders:
     """
 
     open_frames: Callable[[Config], frame_store.FrameStore]
-    load_policy: Callable[[Config, Stats], model.Bundle]  # settings, statistics to normalise with
+    load_policy: Callable[[Config, Stats], Bundle]  # settings, statistics to normalise with
 
 
 LOADERS = Loaders(open_frames, model.load_policy)
@@ -60,11 +61,7 @@ class Client:
         return episode_stats(self.store, self.share.train_ids)
 
     def train(
-        self,
-        bundle: model.Bundle,
-        round_number: int,
-        correction: Correction | None = None,
-        moments: Arrays | None = None,
+        self, bundle: Bundle, round_number: int, correction: Correction | None = None, moments: Arrays | None = None
     ) -> training.TrainResult:
         """Train for one round, continuing the data order and learning-rate schedule of the round before.
 
@@ -86,12 +83,12 @@ class Client:
             self.store, self.share.train_ids, config.chunk_size, config.batch_size, seed=seed, augment=config.augment
         )
 
-    def validate(self, bundle: model.Bundle) -> tuple[int, dict[str, float]]:
+    def validate(self, bundle: Bundle) -> tuple[int, dict[str, float]]:
         """Return the number of held-out frames and the averages over them; 0 and {} without held-out episodes."""
         found = measure(bundle, self.store, self.config, episode_ids=self.share.val_ids)
         return found.num_examples, found.averages
 
-    def roll_out(self, bundle: model.Bundle, videos_dir: Path) -> list[dict[str, Any]]:
+    def roll_out(self, bundle: Bundle, videos_dir: Path) -> list[dict[str, Any]]:
         """Roll the policy out on the client's tasks, in turn, with videos in `videos_dir`; return a row per rollout.
 
         Seeds and the first task differ between clients, so that they do not all show the same scene.

@@ -16,8 +16,9 @@ from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.data import frame_store, normalisation
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds
-from fedvla_lib.federation import checkpoint, client, messages
+from fedvla_lib.federation import checkpoint, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
+from fedvla_lib.federation.client import LOADERS, Loaders, kept_between_rounds
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
@@ -41,7 +42,7 @@ class ClientStates(Protocol):
 
 
 def build(
-    loaders: client.Loaders = client.LOADERS,
+    loaders: Loaders = LOADERS,
     *,
     engine: str = "flower",
     progress: bool = False,
@@ -67,12 +68,7 @@ def build(
 
 
 def federate(
-    grid: Grid,
-    config: Config,
-    run: RunFolder,
-    loaders: client.Loaders,
-    progress: bool,
-    states: ClientStates | None = None,
+    grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, states: ClientStates | None = None
 ) -> None:
     """Run or resume a federation on `grid` and write it to `run`.
 
@@ -134,7 +130,7 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     """Return the checkpoint to resume from, and remove what was written of later rounds."""
     if not config.resume:
         return None
-    settings = [setting for setting, kept in client.kept_between_rounds(config).items() if kept]
+    settings = [setting for setting, kept in kept_between_rounds(config).items() if kept]
     if settings and not states:
         raise ValueError(
             f"{settings[0]} makes clients keep state between rounds, which is lost when a run ends on this "
