@@ -33,14 +33,14 @@ def test_every_trial_has_the_same_budget(strategy):
 
 @pytest.fixture
 def evaluated(monkeypatch):
-    """The episodes behind each loss that the search computes, in order."""
-    episodes, held_out_frames = [], measure.held_out_frames
+    """The episodes behind each loss that the search computes, in order; the runs of its trials name none."""
+    episodes, measured = [], measure.measure
 
-    def recording_ids(bundle, store, episode_ids, config):
-        episodes.append(list(episode_ids))
-        return held_out_frames(bundle, store, episode_ids, config)
+    def noting(*arguments, episode_ids=None, **options):
+        episodes.extend([] if episode_ids is None else [list(episode_ids)])
+        return measured(*arguments, episode_ids=episode_ids, **options)
 
-    monkeypatch.setattr(measure, "held_out_frames", recording_ids)
+    monkeypatch.setattr(measure, "measure", noting)
     return episodes
 
 

@@ -115,7 +115,7 @@ def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
             continue
         if (own := room_of(name)) != room:
             room, told = own, _first_sentence(described.get(own, "What every room may use."))
-            parts.append(f"## {own}\n\n{told}\nIts place in the house: {{ref}}`room-{own}`.\n")
+            parts.append(f"## {own}\n\n{told}\nIts place among the rooms: {{ref}}`room-{own}`.\n")
         parts.append(f"### {name}\n\n```{{eval-rst}}\n.. automodule:: {PACKAGE}.{name}\n   :members:\n```\n")
     return "\n".join(parts)
 
