@@ -221,7 +221,7 @@ def test_intervals_over_seeds_and_rollouts_cover_the_truth_as_often_as_they_say(
     rates = [stats.norm.cdf((np.array([1.0, 0.3]) - shift) / spread).mean() for shift in (0.0, 0.3)]
     columns, covered = outcomes(np.zeros((1, 100))).columns, {"difference": [], "rate": [], "bootstrap": []}
     for k in range(800):
-        shared = of_rollouts * rng.normal(size=100)  # an rollout that is hard is hard for both methods
+        shared = of_rollouts * rng.normal(size=100)  # a rollout that is hard is hard for both methods
         left, right = (
             easy - shift + shared + of_seeds * rng.normal(size=(seeds, 1)) + rng.normal(size=(seeds, 100)) > 0
             for shift in (0.0, 0.3)

@@ -29,7 +29,7 @@ def test_correlations_are_of_ranks_within_each_run_and_over_all():
     )  # fmt: skip
     found = tables.correlations(table)
     assert found[["method", "run"]].values.tolist() == [["a", 0], ["b", 0], ["b", 1], ["all", "all"]]
-    assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without an rollout is none
+    assert found.n.tolist() == [3, 2, 2, 7]  # a checkpoint without a rollout is none
     np.testing.assert_allclose(found.rho[:3], [-1, 1, np.nan])  # all alike: no rank, and no warning
     seen = table[table.n > 0]
     assert found.rho.iloc[-1] == pytest.approx(seen.loss.rank().corr(seen.success_rate.rank()))
