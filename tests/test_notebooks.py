@@ -130,7 +130,7 @@ def test_the_hero_is_described_and_needs_no_run(path):
     look = hero.metadata.get("mystnb", {})
     drawn = bool(look.get("figure", {}).get("caption")) and len(look.get("image", {}).get("alt", "")) > 40
     assert drawn != ("video_figure(" in hero.source)  # whose sentence describes it
-    assert "methods." not in hero.source and "load_policy" not in hero.source  # nothing that trains, or takes long to load
+    assert "methods." not in hero.source and "load_policy" not in hero.source  # nothing that trains or loads for long
 
 
 @each_chapter

@@ -17,7 +17,8 @@ from fedvla_lib.experiments.plan import read_plan
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "book" / "reference"
-CELLS = sorted(stamp.parent for stamp in REFERENCE.glob("*/*/stamp.json"))
+REPLAYED = "replay"  # tiny cells that tests/test_replay.py makes again, so that they are of today's code
+CELLS = sorted(stamp.parent for stamp in REFERENCE.glob("*/*/stamp.json") if stamp.parts[-3] != REPLAYED)
 SEARCHES = tables.read_searches(REFERENCE / "search")
 # Not results: the customary confidence, level and power, and the differences that examples set out to find.
 CUSTOMARY = {"95 %", "80 %", "5 %", "10 points"}

@@ -25,7 +25,7 @@ def grid(tmp_path_factory):
 
 def events(cell: Path) -> list[tuple]:
     """What a cell's events say, in order: round, who, kind, and values by name."""
-    found = run_folder.read_events(cell / "metrics.jsonl")
+    found = run_folder.read_events(cell)
     return [
         (event["round"], event["who"], event["kind"], {k: v for k, v in event["values"].items() if k not in FLEETING})
         for event in found
