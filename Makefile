@@ -120,7 +120,7 @@ test: export HF_HUB_OFFLINE := 1
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
-	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml $(CURDIR)/_build/tests/junit-notebooks.xml
+	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \
