@@ -21,7 +21,7 @@ from fedvla_lib.engines import inline
 from fedvla_lib.evaluation import compare_runs, measure
 from fedvla_lib.evaluation.rollouts import FIRST_SEED
 from fedvla_lib.experiments import experiment, methods, results
-from fedvla_lib.experiments.plan import QUIET, Cell, Plan, read_plan
+from fedvla_lib.experiments.experiment_file import QUIET, Cell, Plan, read_plan
 from fedvla_lib.federation.client import CLIENT_SEEDS
 
 REFERENCE = Path(__file__).parents[1] / "book" / "reference"

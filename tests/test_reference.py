@@ -12,7 +12,7 @@ from fedvla_book import tables
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
 from fedvla_lib.experiments import methods, results
-from fedvla_lib.experiments.plan import read_plan
+from fedvla_lib.experiments.experiment_file import read_plan
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]

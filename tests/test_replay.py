@@ -7,7 +7,7 @@ import pytest
 
 from fedvla_lib import run_folder
 from fedvla_lib.experiments import experiment
-from fedvla_lib.experiments.plan import KINDS, read_plan
+from fedvla_lib.experiments.experiment_file import KINDS, read_plan
 
 pytestmark = pytest.mark.integration
 REFERENCE = Path(__file__).parents[1] / "book" / "reference"

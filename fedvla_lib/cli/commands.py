@@ -206,7 +206,7 @@ def _print_rounds(folder: Path) -> None:
 def experiment(options: argparse.Namespace) -> None:
     """Run the unfinished cells of an experiment and print the summary."""
     from fedvla_lib.experiments.experiment import run_plan
-    from fedvla_lib.experiments.plan import read_plan
+    from fedvla_lib.experiments.experiment_file import read_plan
     from fedvla_lib.experiments.results import read_results, summary
 
     run_plan(read_plan(options.file), options.out)

@@ -149,7 +149,7 @@ def _add_evaluate(subparsers: Any) -> None:
 def _add_experiment(subparsers: Any) -> None:
     text = "train and measure a grid of methods, partitions and seeds"
     parser = _command(subparsers, commands.experiment, text, f"finished cells are kept, {CONTINUES}")
-    parser.add_argument("file", type=Path, help="the plan, a TOML file; see fedvla_lib/experiments/plan.py")
+    parser.add_argument("file", type=Path, help="the plan, a TOML file; see fedvla_lib/experiments/experiment_file.py")
     text = "the folder for the results, a run folder per cell"
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=text)
 

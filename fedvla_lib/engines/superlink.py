@@ -1,12 +1,12 @@
 """Wrappers of Flower's programs: a local SuperLink, `flwr run`, and the final status of a run.
 
-Used by `simulation`, `deployment` and `superlink_service`. Flower's defaults do not suit a small machine or a script:
-`flwr run` gives the SuperLink that it starts only 15 s, and exits with 0 even if the run failed.
+Flower's own `flwr run` gives the SuperLink that it starts only 15 s, and exits with 0 even if the run failed.
 """
 
 import json
 import os
 import re
+import shlex
 import ssl
 import subprocess
 import sys
@@ -116,7 +116,9 @@ def flower_environment(home: Path) -> dict[str, str]:
     """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
     plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "CLICOLOR_FORCE")}
-    return {**plain, **OFFLINE, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
+    # Ray pastes this interpreter's path into a shell command unquoted, which fails if a folder's name has a space.
+    ray = {"RAY_JOB_CONFIG_JSON_ENV_VAR": json.dumps({"runtime_env": {"py_executable": shlex.quote(sys.executable)}})}
+    return {**plain, **OFFLINE, **ray, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
 
 
 def require_completed(link: SuperLink, run_id: str) -> None:

@@ -15,7 +15,7 @@ from fedvla_lib.data import recordings
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import success_rate
 from fedvla_lib.experiments import methods
-from fedvla_lib.experiments.plan import Cell, Plan
+from fedvla_lib.experiments.experiment_file import Cell, Plan
 from fedvla_lib.federation.nodes import client_name
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.run_folder import GLOBAL, RunFolder

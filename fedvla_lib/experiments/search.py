@@ -21,7 +21,7 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import roll_out, rollout_seeds
 from fedvla_lib.experiments import methods
 from fedvla_lib.experiments.experiment import with_recording
-from fedvla_lib.experiments.plan import QUIET
+from fedvla_lib.experiments.experiment_file import QUIET
 from fedvla_lib.federation.nodes import TooFewReplies, sample_size
 from fedvla_lib.files import write_json
 from fedvla_lib.policy.model import Bundle
