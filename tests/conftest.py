@@ -47,7 +47,7 @@ def wait_for_interrupted(root: Path) -> None:
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Flower's engines run the ClientApp of `faulty.py` in place of the library's."""
-    from fedvla_lib.engines import app_bundle, superlink
+    from fedvla_lib.engines import app_bundle
 
     stage = app_bundle.stage_app
 
@@ -59,7 +59,7 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
         project.write_text(told.replace("fab-include = [", 'fab-include = ["faulty.py", '))
         return app
 
-    monkeypatch.setattr(superlink, "stage_app", stage_faulty)
+    monkeypatch.setattr(app_bundle, "stage_app", stage_faulty)
 
 
 def assert_faults_were_survived(root: Path, config) -> None:

@@ -179,6 +179,7 @@ def test_a_shell_without_a_place_of_its_own_is_told_what_to_do(monkeypatch, caps
 def test_the_shells_settings_find_this_projects_programs():
     command = ". flower/env.sh && command -v fedvla flwr && echo $FLWR_HOME"
     clean = {key: value for key, value in os.environ.items() if not key.startswith(("FLWR_", "FEDVLA_"))}
-    said = subprocess.run(["sh", "-c", command], cwd=ROOT, env=clean, capture_output=True, text=True).stdout.split()
+    said = subprocess.run(["sh", "-c", command], cwd=ROOT, env=clean, capture_output=True, text=True)
+    said = said.stdout.splitlines()  # a folder's name may have a space
     assert said[-1] == str(ROOT / ".cache/flwr")
     assert not (ROOT / ".venv").exists() or str(ROOT / ".venv/bin/fedvla") in said

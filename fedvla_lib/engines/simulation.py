@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fedvla_lib.config import Config, absolute, check
-from fedvla_lib.engines.app_bundle import stage_app, write_settings
+from fedvla_lib.engines import app_bundle
 from fedvla_lib.engines.superlink import SuperLink, local_superlink, require_completed
 from fedvla_lib.run_folder import own_run, run_folders
 
@@ -28,7 +28,7 @@ def run_simulation(
     before = run_folders(config)
     resources = f"client-resources-num-cpus={cpus_per_client} client-resources-num-gpus={gpus_per_client}"
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
-        app, settings = stage_app(Path(folder)), write_settings(Path(folder), config)
+        app, settings = app_bundle.stage_app(Path(folder)), app_bundle.write_settings(Path(folder), config)
         with local_superlink(Path(folder), "--simulation") as link:
             federation = f"num-supernodes={config.num_clients} {resources}"
             options = ["--federation-config", federation, "--run-config", str(settings)]
