@@ -163,7 +163,7 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
 
 def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(standing, tiny, monkeypatch, capsys):
     """On the running processes; stopping new ones is tested with the interrupt."""
-    monkeypatch.setattr(deployment, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    monkeypatch.setattr(deployment, "running_deployment", lambda *_, **__: contextlib.nullcontext(standing))
     flags = [f"--{name}={value}" for name, value in given(replace(tiny, min_replies=3)).items()]
     assert main(["deploy", "--profile", "tiny", "--tls", "--auth", *flags]) == 2
     said = capsys.readouterr().err
@@ -177,7 +177,7 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     shutil.copytree(whole, begun)
     shutil.rmtree(begun / "checkpoints/round_2")
     write_json(begun / "stamp.json", {**run_folder.read_stamp(begun), "status": "interrupted"})
-    monkeypatch.setattr(deployment, "deployment", lambda *_, **__: contextlib.nullcontext(standing))
+    monkeypatch.setattr(deployment, "running_deployment", lambda *_, **__: contextlib.nullcontext(standing))
     assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 0
     said = capsys.readouterr().out
     assert "round 2, client_1, train: loss" in said and "round 1, client_1" not in said and str(begun) in said
@@ -185,7 +185,7 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     assert apart(resumed, at_once) <= 1e-6
     trained, wanted = (run_folder.read_metrics(root, "train")[["round", "who"]] for root in (begun, whole))
     assert trained.values.tolist() == wanted.values.tolist()
-    monkeypatch.setattr(deployment, "deployment", None)  # nothing is started any more
+    monkeypatch.setattr(deployment, "running_deployment", None)  # nothing is started any more
     assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 2
     said = capsys.readouterr()
     assert "is a completed run" in said.err and said.err.count("\n") == 1 and not said.out
