@@ -12,11 +12,7 @@ import numpy as np
 
 
 class SceneRenderer(mujoco.Renderer):
-    """A renderer that can be closed without breaking the other renderers of the process.
-
-    MuJoCo frees a renderer's buffers in whichever OpenGL context is current. Buffer ids are per context, so freeing
-    them in another renderer's context deletes that renderer's buffers, and it returns garbage from then on.
-    """
+    """A renderer of fixed cameras that can be closed without breaking the other renderers of the process."""
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         super().__init__(model, height, width)
@@ -34,6 +30,10 @@ class SceneRenderer(mujoco.Renderer):
             return self.render()
 
     def close(self) -> None:
+        """Free the buffers in this renderer's own OpenGL context; MuJoCo frees them in whichever one is current.
+
+        Buffer ids are per context: freeing in another's deletes that renderer's buffers, and it returns garbage then.
+        """
         if self._gl_context:
             self._gl_context.make_current()
         super().close()
