@@ -4,6 +4,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def new_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`, renamed to `path` if the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{os.getpid()}.{path.name}")  # same suffix: NumPy would add its own
+    draft = path.with_name(f".{path.name}.{os.getpid()}")  # other suffix: readers of *.parquet do not see it
     try:
         yield draft
         os.replace(draft, path)
@@ -51,22 +52,21 @@ def new_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
         OSError: also for write errors of safetensors, which has its own exception; the message names `folder`.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = folder.with_name(f".{os.getpid()}.{folder.name}")
-    shutil.rmtree(draft, ignore_errors=True)  # left by a killed process with this id
-    draft.mkdir()
-    try:
-        yield draft
+    hidden = {"dir": folder.parent, "prefix": f".{folder.name}.", "ignore_cleanup_errors": True}
+    with tempfile.TemporaryDirectory(**hidden) as scratch:
+        draft = Path(scratch) / folder.name
+        draft.mkdir()
+        try:
+            yield draft
+        except SafetensorError as error:
+            raise OSError(f"cannot write {folder}: {error}") from error
         if replace:
             shutil.rmtree(folder, ignore_errors=True)
         try:
             os.replace(draft, folder)
         except OSError:
-            if not folder.is_dir():
+            if replace or not folder.is_dir():
                 raise
-    except SafetensorError as error:
-        raise OSError(f"cannot write {folder}: {error}") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def as_json(value: Any) -> Any:

@@ -256,11 +256,11 @@ except OSError as error:
 
 
 @pytest.mark.unit
-def test_a_full_disk_is_an_error_of_one_line_that_names_the_folder_and_leaves_the_checkpoint_before(tmp_path):
+def test_a_full_disk_is_an_error_of_one_line_that_names_the_file_and_leaves_the_checkpoint_before(tmp_path):
     """In a process with a limit on file sizes: safetensors then raises its own error, which is not an OSError."""
     checkpoint.save(tmp_path, Checkpoint(0, {"w": np.ones(3, np.float32)}, {}, {}))
     done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith(f"cannot write {tmp_path}/checkpoints/round_1: ")
+    assert done.stdout.startswith(f"cannot write {tmp_path}/checkpoints/round_1/clients.safetensors: ")
     assert done.stdout.count("\n") == 1
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["round_0"]
     assert checkpoint.load(tmp_path).round == 0

@@ -18,6 +18,7 @@ from lerobot.datasets import LeRobotDataset
 
 from fedvla_lib.data.frame_store import fit_square, open_store
 from fedvla_lib.data.lerobot_reader import DataError, locate
+from fedvla_lib.files import new_file
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, JOINT_NAMES, STATE_KEY, image_key
 
 SIZE = 64  # of the recording in conftest
@@ -106,6 +107,27 @@ def test_a_build_that_died_is_made_again(recording, store, tmp_path, monkeypatch
     np.testing.assert_array_equal(mended.images["front"], store.images["front"])
 
 
+@pytest.mark.integration
+def test_what_killed_processes_left_is_neither_read_nor_kept(recording, store, tmp_path, monkeypatch):
+    monkeypatch.setenv("FEDVLA_CACHE", str(tmp_path / "cache"))
+    root = shutil.copytree(recording, tmp_path / "recording")
+    table = root / "meta/episodes/chunk-000/file-011.parquet"
+    try:
+        with new_file(table) as draft:
+            left = draft.name
+            draft.write_bytes(table.read_bytes()[:100])
+            raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        (table.parent / left).write_bytes(b"PAR1")  # as after a kill, which runs no cleanup
+    opened = open_store(root, image_size=SIZE, progress=False)
+    pd.testing.assert_frame_equal(opened.episodes, store.episodes)
+    (built,) = [path for path in (tmp_path / "cache/frames").iterdir() if path.is_dir()]
+    left = built.with_name(f".{built.name}.killed")
+    built.rename(left)
+    open_store(root, image_size=SIZE, progress=False)
+    assert built.is_dir() and not left.exists()
+
+
 # --- other people's data sets ---------------------------------------------------------------------------------------
 
 
@@ -140,7 +162,6 @@ def test_a_foreign_data_set_opens_with_its_own_rate_names_and_sizes(tmp_path):
     write_foreign(tmp_path / "data")
     store = open_store(tmp_path / "data", image_size=32, progress=False)
     assert store.fps == 30
-    assert store.joint_names == JOINT_NAMES
     assert sorted(store.images) == ["front", "overhead"]
     assert list(store.episodes["task"]) == ["Stack the blocks.", "lift"]
     assert list(store.episodes["num_frames"]) == [7, 5]

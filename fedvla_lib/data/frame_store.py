@@ -7,6 +7,7 @@ and later only maps the files. This module does not know the data set's file for
 
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,6 @@ from tqdm.auto import tqdm
 
 from fedvla_lib.data.lerobot_reader import ReadDataset, locate, read_dataset, read_images
 from fedvla_lib.files import cache_dir, new_folder
-from fedvla_lib.robot.spec import JOINT_NAMES
 
 STORE_VERSION = 2  # part of every store's key; increase it when the file format of a store changes
 
@@ -35,11 +35,6 @@ class FrameStore:
     actions: np.ndarray  # float32 (N, 6): joint targets, LeRobot units
     images: dict[str, np.ndarray]  # camera -> uint8 (N, size, size, 3), memory-mapped, read-only
     episodes: pd.DataFrame  # episode_id, start, end (rows, end excluded), num_frames, instruction, task, lab
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the six columns of `states` and `actions`."""
-        return JOINT_NAMES
 
     @property
     def num_frames(self) -> int:
@@ -79,6 +74,8 @@ def open_store(
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.with_suffix(".lock")):  # so that concurrent processes decode a data set once
             if not folder.is_dir():
+                for left in folder.parent.glob(f".{key}.*"):  # by a process that was killed while it decoded
+                    shutil.rmtree(left)
                 dataset = read_dataset(root, cameras)
                 with new_folder(folder) as draft:
                     _build(dataset, image_size, draft, progress)

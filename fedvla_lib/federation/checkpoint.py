@@ -44,13 +44,16 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint to the run folder atomically, and remove all but the last two.
 
     Raises:
-        OSError: it cannot be written; the message names the folder.
+        OSError: it cannot be written; the message names the file.
     """
     folder = root / "checkpoints" / f"round_{checkpoint.round}"
     with new_folder(folder, replace=True) as draft:
         for part in PARTS:
-            arrays = getattr(checkpoint, part)
-            save_file(arrays, draft / f"{part}.safetensors", metadata={HASH: digest(arrays)})
+            arrays, name = getattr(checkpoint, part), f"{part}.safetensors"
+            try:
+                save_file(arrays, draft / name, metadata={HASH: digest(arrays)})
+            except SafetensorError as error:  # of a full disk
+                raise OSError(f"cannot write {folder / name}: {error}") from error
     for old in sorted(_rounds(root))[:-KEPT]:
         shutil.rmtree(root / "checkpoints" / f"round_{old}")
 
