@@ -21,7 +21,7 @@ class Config:
     image_size: int = 96  # side length of the square camera images, in pixels
     num_labs: int = 1  # labs that record demonstrations; each has its own cameras, light, colours and calibration
     val_fraction: float = 0.1  # fraction of each task's episodes held out for validation
-    normalisation: str = "pooled"  # joint statistics: pooled, or a mistake to measure: own, held-out, none
+    normalisation: str = "pooled"  # joint statistics: pooled, or a deliberate mistake: own, held-out, none
     augment: bool = False  # augment training images; if off, the prefix of a frozen model is cached for each frame
     # federation
     num_clients: int = 10  # clients that the episodes are partitioned over
@@ -34,7 +34,7 @@ class Config:
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian, krum or scaffold
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam and fedyogi; 0 uses the strategy's default
-    server_momentum: float = 0.5  # fedavgm: server momentum coefficient m; steady updates grow by 1 / (1 - m)
+    server_momentum: float = 0.5  # fedavgm: server momentum coefficient m; constant updates are scaled by 1 / (1 - m)
     clip_norm: float = 0.0  # maximum L2 norm of a client's update; 0 does not clip
     num_malicious: int = 1  # krum: Byzantine clients tolerated per round
     personal: str = ""  # model parts that stay on each client, comma separated: projections, expert layer N
@@ -115,15 +115,16 @@ def to_run_config(config: Config) -> dict[str, Any]:
 
 def task_names(config: Config) -> list[str]:
     """Return `config.tasks` as a list."""
-    return _split(config.tasks)
+    return split_names(config.tasks)
 
 
 def personal_parts(config: Config) -> list[str]:
     """Return `config.personal` as a list."""
-    return _split(config.personal)
+    return split_names(config.personal)
 
 
-def _split(names: str) -> list[str]:
+def split_names(names: str) -> list[str]:
+    """Return names that are separated by commas as a list."""
     return [name.strip() for name in names.split(",") if name.strip()]
 
 

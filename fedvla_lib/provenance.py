@@ -23,14 +23,14 @@ PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", 
 LIBRARY = Path(__file__).parent
 
 
-def code_digest(*functions: Callable[..., Any]) -> str:
-    """Return a short hash of what the code reached from `functions` does.
+def code_digest(function: Callable[..., Any]) -> str:
+    """Return a short hash of what the code reached from `function` does.
 
-    It covers all statements of all library modules that the functions' modules import, directly or indirectly. Imports,
+    It covers all statements of all library modules that the function's module imports, directly or indirectly. Imports,
     comments, docstrings and the place of a statement do not count, so moving code does not change it. Names of cached
     results contain it, so that results of older code are not reused.
     """
-    modules = {module for function in functions for module in reached_modules(function.__module__)}
+    modules = reached_modules(function.__module__)
     statements = sorted(statement for module in modules for statement in _statements(module))
     return hashlib.sha256("\n".join(statements).encode()).hexdigest()[:12]
 

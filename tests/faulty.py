@@ -1,4 +1,4 @@
-"""A ClientApp that fails on the way: in round 1 client 0 raises, in round 2 client 1 sends what is no number.
+"""A ClientApp that fails on the way: in round 1 client 0 raises, in round 2 client 1 sends NaN.
 
 Tests put this file into the app that Flower's engines run, and pass its app to the inline engine.
 """

@@ -1,4 +1,4 @@
-"""The benchmarks run, and both sides of them compute the same thing; how fast is not a test's business."""
+"""The benchmarks run, and both sides of them compute the same thing; how fast they are is not tested."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The house rules about imports: the order of the rooms, who may use which heavy package, and that no circle exists."""
+"""Import rules: the order of the packages, which of them may use which heavy dependency, and no circles."""
 
 import ast
 import subprocess
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]
 MODULES = library.modules(ROOT)  # raises if there is none
 BOOK = {path.stem: ast.parse(path.read_text()) for path in (ROOT / "book" / "fedvla_book").rglob("*.py")}
-# A room may import itself and what stands before it.
+# A package may import itself and what stands before it.
 ORDER = (
     library.ROOT_FILES, "robot", "data", "policy", "evaluation", "federation", "pretraining", "engines", "experiments",
     "cli",
@@ -25,7 +25,7 @@ ROOT_ORDER = ("config", "files", "provenance", "run_folder")
 APART = {"pretraining": {"federation"}}  # before it in the list, and still not its business
 STRATEGIES = "federation.strategies"
 
-# Heavy package -> rooms or modules that may import it, anywhere in them but the commands, which import when they run.
+# Heavy dependency -> packages or modules that may import it, anywhere but in commands, which import when they run.
 FENCES = {
     "mujoco": {"robot"},
     "mink": {"robot.expert"},
@@ -65,7 +65,7 @@ def stands_in(name: str, places: set[str]) -> bool:
 
 
 def upward(names, imported) -> list[tuple[str, str]]:
-    """Imports that go against the order of rooms, or into a room that is not the importer's business."""
+    """Imports that go against the order of packages, or into a package that is not the importer's business."""
     found = []
     for name in names:
         for other in imported(name):
@@ -117,7 +117,7 @@ def test_only_the_engines_import_the_apps():
 
 
 def test_a_package_holds_a_paragraph_and_no_imports():
-    """Else asking for one module loads a whole room: `fedvla --help` would load torch."""
+    """Else asking for one module loads a whole package: `fedvla --help` would load torch."""
     for file in (ROOT / "fedvla_lib").rglob("*/__init__.py"):
         tree = ast.parse(file.read_text())
         assert len(tree.body) == 1, file

@@ -1,4 +1,4 @@
-"""Properties of the exchange format: what comes back is what went out, and nothing damaged gets through."""
+"""Properties of the exchange format: round trips are exact, and damaged arrays are rejected."""
 
 import numpy as np
 import pytest

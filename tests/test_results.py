@@ -1,4 +1,4 @@
-"""Checkpoints of stored runs: how held-out loss ranks them beside success, and which pairs it ranks the wrong way."""
+"""Checkpoints of stored runs: how held-out loss ranks them compared with success, and which pairs it misranks."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The search keeps its budget, resumes, and reports on data that selected nothing."""
+"""The search keeps its budget, resumes, and reports on data not used to select."""
 
 import json
 from dataclasses import asdict, replace

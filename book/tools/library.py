@@ -10,7 +10,8 @@ import networkx
 from IPython.core.inputtransformer2 import TransformerManager
 
 PACKAGE = "fedvla_lib"
-ROOT_FILES = "root"  # the room of the modules that stand in no package
+ROOT_FILES = "root"  # stands for the package of the modules that are in none
+ROOT_SAYS = "What every package may use."
 ARROWHEAD = (
     '<defs><marker id="head" viewBox="0 0 8 8" refX="2" refY="4" markerWidth="5" markerHeight="5" orient="auto">'
     '<polygon points="0,0 8,4 0,8" fill="#0072b2"/></marker></defs>'
@@ -59,7 +60,7 @@ def imports(trees: dict[str, ast.Module]) -> networkx.DiGraph:
 
 
 def between_rooms(graph: networkx.DiGraph) -> networkx.DiGraph:
-    """Return the graph of rooms: an arrow goes from a room to one of which it imports a module."""
+    """Return the graph of packages: an arrow goes from a package to one of which it imports a module."""
     found = networkx.DiGraph()
     found.add_nodes_from(room_of(name) for name in graph)
     found.add_edges_from((room_of(a), room_of(b)) for a, b in graph.edges if room_of(a) != room_of(b))
@@ -107,28 +108,28 @@ def _uses(trees: list[ast.Module]) -> Iterator[str]:
 
 
 def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
-    """Return a section for each room and each of its modules that documents something, for Sphinx's autodoc to fill."""
+    """Return a section for each package and each of its documented modules, for Sphinx's autodoc to fill."""
     parts, room = [], ""
     for name in sorted(trees, key=lambda name: (room_of(name) != ROOT_FILES, name)):
         public = [node.name for node in trees[name].body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
         if not any(not one.startswith("_") for one in public):
             continue
         if (own := room_of(name)) != room:
-            room, told = own, _first_sentence(described.get(own, "What every room may use."))
-            parts.append(f"## {own}\n\n{told}\nIts place among the rooms: {{ref}}`room-{own}`.\n")
+            room, told = own, _first_paragraph(described.get(own, ROOT_SAYS))
+            parts.append(f"## {own}\n\n{told}\nIts place in the library: {{ref}}`room-{own}`.\n")
         parts.append(f"### {name}\n\n```{{eval-rst}}\n.. automodule:: {PACKAGE}.{name}\n   :members:\n```\n")
     return "\n".join(parts)
 
 
 def table(root: Path, used: dict[str, list[str]]) -> str:
-    """Return a section for each room: its paragraph, and its modules as a table with the first chapter that uses each.
+    """Return a section for each package: its paragraph, and its modules in a table, with the first chapter to use each.
 
-    Nested packages stand with the room that they are in.
+    Nested packages stand with the one that they are in.
     """
     trees, described = modules(root), rooms(root)
     parts = []
     for room in [ROOT_FILES, *(name for name in described if "." not in name)]:
-        words = described.get(room, "What every room may use.").replace("\n\n", "\n")
+        words = described.get(room, ROOT_SAYS).replace("\n\n", "\n")
         parts += [f"(room-{room})=", f"### {room}", "", words, ""]
         parts += [described[inner].replace("\n\n", "\n") + "\n" for inner in described if inner.startswith(f"{room}.")]
         parts += ["| module | what it is for | first used in |", "|---|---|---|"]
@@ -139,16 +140,16 @@ def table(root: Path, used: dict[str, list[str]]) -> str:
 def _row(name: str, tree: ast.Module, used: dict[str, list[str]]) -> str:
     full = f"{PACKAGE}.{name}"
     chapters = sorted({one for key, found in used.items() if f"{key}.".startswith(f"{full}.") for one in found})
-    said = " ".join((ast.get_docstring(tree) or "").split("\n\n")[0].split()).replace("|", "\\|")
+    said = _first_paragraph(ast.get_docstring(tree) or "").replace("|", "\\|")
     return f"| `{name}` | {said} | {f'[](../notebooks/{chapters[0]}.ipynb)' if chapters else ''} |"
 
 
-def _first_sentence(text: str) -> str:
+def _first_paragraph(text: str) -> str:
     return " ".join(text.split("\n\n")[0].split())
 
 
 def picture(graph: networkx.DiGraph) -> str:
-    """Return the rooms as an SVG, their modules in them: what a room imports stands above it.
+    """Return the packages as an SVG, their modules in them: what a package imports stands above it.
 
     Only arrows that no longer path implies are drawn.
     """

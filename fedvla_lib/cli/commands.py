@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from fedvla_lib.config import Config, from_profile, task_names, to_run_config
+from fedvla_lib.config import Config, from_profile, split_names, task_names, to_run_config
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.robot.spec import CAMERAS, image_key
 
@@ -65,7 +65,6 @@ def pretrain(options: argparse.Namespace) -> None:
 def experts(options: argparse.Namespace) -> None:
     """Print each expert's success rate with its confidence interval."""
     import pandas as pd
-    from tqdm.auto import tqdm
 
     from fedvla_lib.evaluation.rollouts import rollout_seeds
     from fedvla_lib.evaluation.statistics import success_table
@@ -74,7 +73,7 @@ def experts(options: argparse.Namespace) -> None:
 
     _require_positive("--episodes", options.episodes)
     tasks = check_tasks(options.task or list(TASKS))
-    rows = [row for task in tasks for row in expert_success(task, tqdm(rollout_seeds(options.episodes), desc=task))]
+    rows = [row for task in tasks for row in expert_success(task, rollout_seeds(options.episodes))]
     _print_table(success_table(pd.DataFrame(rows), ["task"]))
 
 
@@ -253,7 +252,7 @@ def compare(options: argparse.Namespace) -> None:
     """Print the measurements of runs and their differences; runs that are not comparable are an error."""
     from fedvla_lib.evaluation import compare_runs, statistics
 
-    metrics = statistics.check_metrics(options.metrics.split(","), compare_runs.METRICS)
+    metrics = statistics.check_metrics(split_names(options.metrics), compare_runs.METRICS)
     if len(options.runs) < 2 or len({path.resolve() for path in options.runs}) < len(options.runs):
         raise ValueError(f"runs {', '.join(map(str, options.runs))}: give two or more different run folders")
     if not 0.5 <= options.confidence < 1:
@@ -282,7 +281,7 @@ def videos(options: argparse.Namespace) -> int:
 
     from fedvla_lib.evaluation import statistics, video_report
 
-    metrics = statistics.check_metrics(options.metrics.split(","), video_report.METRICS)
+    metrics = statistics.check_metrics(split_names(options.metrics), video_report.METRICS)
     rows, damaged = video_report.read_videos(options.folder)
     if options.who and len(rows):
         names = sorted(set(rows.who))

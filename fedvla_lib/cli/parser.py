@@ -88,9 +88,9 @@ def _add_experts(subparsers: Any) -> None:
 
 def _add_train(subparsers: Any) -> None:
     kept = "checkpoints are in the run folder; fedvla train --resume FOLDER continues"
-    text = "train a policy without federation: on all data, or on the part of one client"
+    text = "train a policy without federation: on all data, or on one client's partition"
     parser = _command(subparsers, commands.train, text, kept)
-    parser.add_argument("--client", type=int, metavar="K", help="train on the part of client K only")
+    parser.add_argument("--client", type=int, metavar="K", help="train on client K's partition only")
     text = "gradient steps (default: num-server-rounds times local-steps)"
     parser.add_argument("--steps", type=int, metavar="N", help=text)
     _add_resume(parser)
@@ -99,7 +99,7 @@ def _add_train(subparsers: Any) -> None:
 
 def _add_run(subparsers: Any) -> None:
     kept = "completed rounds are in the run folder"
-    parser = _command(subparsers, commands.run, "run a federation with simulated clients", kept)
+    parser = _command(subparsers, commands.run, "run federated training with simulated clients", kept)
     text = "inline: one client after the other, in this process; simulation: Flower's simulation, in several processes"
     parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
     _add_resume(parser)
@@ -155,7 +155,7 @@ def _add_experiment(subparsers: Any) -> None:
 
 
 def _add_search(subparsers: Any) -> None:
-    text = "search for the best settings of a federation at equal gradient steps"
+    text = "tune the settings of a federated run at a fixed budget of gradient steps"
     parser = _command(subparsers, commands.search, text, f"finished trials are kept, {CONTINUES}")
     parser.add_argument("--trials", type=int, default=20, metavar="N", help="settings to try (default: 20)")
     text = "rollouts per task with the first and the best settings (default: 20)"
@@ -198,7 +198,7 @@ def _add_metrics(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _add_resume(parser: argparse.ArgumentParser) -> None:
-    text = "the folder of an interrupted run to continue with its own settings"
+    text = "run folder of an interrupted run to resume with its own settings"
     parser.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help=text)
 
 

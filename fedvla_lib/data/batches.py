@@ -61,7 +61,7 @@ class Batches:
         Every epoch visits each frame once, in a new random order; a batch may span two epochs.
         """
         rng = np.random.default_rng([self.seed, AUGMENT_STREAM, step]) if self.augment else None
-        return _batch(self.store, self.rows_at(step), self.chunk_size, rng)
+        return batch_of_rows(self.store, self.rows_at(step), self.chunk_size, rng)
 
     def rows_at(self, step: int) -> np.ndarray:
         """Return the store's rows in the batch of a gradient step, int64 (batch_size,)."""
@@ -77,16 +77,15 @@ class Batches:
         return self.rows[indices]
 
 
-def batch_of_rows(store: FrameStore, rows: Sequence[int] | np.ndarray, chunk_size: int) -> dict[str, Any]:
-    """Return the batch of these rows, without augmentation.
+def batch_of_rows(
+    store: FrameStore, rows: Sequence[int] | np.ndarray, chunk_size: int, rng: np.random.Generator | None = None
+) -> dict[str, Any]:
+    """Return the batch of these rows, with images augmented by `rng` if it is given.
 
     ``observation.images.<camera>``: float32 (B, 3, size, size) in [0, 1]; ``observation.state``: float32 (B, 6);
     ``action``: float32 (B, chunk_size, 6); ``action_is_pad``: bool (B, chunk_size); ``task``: B instructions.
     """
-    return _batch(store, np.asarray(rows), chunk_size, None)
-
-
-def _batch(store: FrameStore, rows: np.ndarray, chunk_size: int, rng: np.random.Generator | None) -> dict[str, Any]:
+    rows = np.asarray(rows)
     pixels = {camera: images[rows] for camera, images in store.images.items()}  # uint8 (B, H, W, 3)
     floats = {camera: to_float(images) for camera, images in pixels.items()} if rng is None else augmented(pixels, rng)
     return {image_key(camera): images for camera, images in floats.items()} | targets_of_rows(store, rows, chunk_size)

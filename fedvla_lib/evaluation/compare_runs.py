@@ -17,7 +17,7 @@ from fedvla_lib.evaluation import figures, statistics
 
 SUCCESS = "success_rate"
 METRICS = ("loss", "action_error", "action_accuracy", SUCCESS)
-SINGLE_MODEL = ("global", "local")  # values of `who` in measurements of a run's one model
+SINGLE_MODEL = (run_folder.GLOBAL, "local")  # values of `who` in measurements of a run's one model
 ROLLOUT_KEY = ["task", "lab", "seed"]
 LAST = ["p_value", "p_holm", "mismatch"]  # columns after the effect and its interval
 # Settings that decide what is measured, or where training starts.
@@ -89,8 +89,7 @@ def _mismatches(first: Run, other: Run, metrics: Sequence[str]) -> dict[str, str
     found = {name: f"{left!r} and {right!r}" for name, left, right in pairs if left != right}
     if set(metrics) - {SUCCESS} and set(first.episodes.index) != set(other.episodes.index):
         found["held-out episodes"] = f"{list(first.episodes.index)} and {list(other.episodes.index)}"
-    left, right = _rollout_keys(first), _rollout_keys(other)
-    if SUCCESS in metrics and left != right:
+    if SUCCESS in metrics and (left := _rollout_keys(first)) != (right := _rollout_keys(other)):
         found["rollouts"] = f"{len(left)} and {len(right)}, of which {len(left & right)} are common"
     return found
 

@@ -7,16 +7,17 @@ import numpy as np
 import torch
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import frame_store
 from fedvla_lib.data.batches import batch_of_rows
+from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.data.splits import frame_spans
-from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import predict_chunk
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES
 
+VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly the same
+VALIDATION_BATCH = 32  # fixed, so that the noise does not depend on the batch size of training
 
-@torch.no_grad()
+
 def validate(bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0) -> dict[str, float]:
     """Return the averages of `measure_frames` over all frames of the batches."""
     return average(measure_frames(bundle, batches, tolerance=tolerance, seed=seed))
@@ -78,12 +79,8 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.double().cpu().numpy()
 
 
-VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly the same
-VALIDATION_BATCH = 32  # fixed, so that the noise does not depend on the batch size of training
-
-
 def held_out_frames(
-    bundle: model.Bundle, store: frame_store.FrameStore, episode_ids: Sequence[int], config: Config
+    bundle: Bundle, store: FrameStore, episode_ids: Sequence[int], config: Config
 ) -> dict[str, np.ndarray]:
     """Return `measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
     batches = held_out_batches(store, episode_ids, config)
@@ -93,7 +90,7 @@ def held_out_frames(
 
 
 def by_episode(
-    frames: dict[str, np.ndarray], store: frame_store.FrameStore, episode_ids: Sequence[int]
+    frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]
 ) -> list[dict[str, float]]:
     """Return the averages of `held_out_frames` for each episode, with episode_id and num_examples."""
     counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
@@ -104,7 +101,7 @@ def by_episode(
     ]
 
 
-def held_out_batches(store: frame_store.FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:
+def held_out_batches(store: FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:
     """Return raw batches of every fifth frame of the given episodes, without augmentation."""
     rows = [row for start, end in frame_spans(store, episode_ids) for row in range(start, end, VALIDATION_STRIDE)]
     cuts = range(0, len(rows), VALIDATION_BATCH)

@@ -50,7 +50,7 @@ def measure(
     videos_dir: Path | None = None,
     progress: bool = False,
 ) -> Measurement:
-    """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task of the mix and seed.
+    """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task and seed.
 
     Args:
         episode_ids: None takes all held-out episodes.

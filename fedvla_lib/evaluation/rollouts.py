@@ -11,12 +11,12 @@ from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, task_names
 from fedvla_lib.evaluation.video import save_rollout
-from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.rollout import Episode, act_in_turn, run_episodes
 from fedvla_lib.robot.sim import So100Env
-from fedvla_lib.robot.spec import CAMERAS, FPS, Actor
+from fedvla_lib.robot.spec import CAMERAS, Actor
 
 AT_ONCE = 16  # rollouts that share one batch of policy inference
 FIRST_SEED = 1_000_000  # far from the seeds of recorded demonstrations
@@ -89,7 +89,7 @@ def row(episode: Episode) -> dict[str, Any]:
     return {
         "task": episode.task, "instruction": episode.instruction, "seed": episode.seed,
         "success": bool(episode.success), "steps": episode.num_frames,
-        "completion_time_s": episode.num_frames / FPS if episode.success else float("nan"),
+        "completion_time_s": episode.duration_s if episode.success else float("nan"),
         "action_smoothness": smoothness(episode.actions),
     }  # fmt: skip
 
@@ -109,9 +109,9 @@ def success_rate(rows: Sequence[dict[str, Any]]) -> float:
 
 
 def roll_out(
-    bundle: model.Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False
+    bundle: Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False
 ) -> list[dict[str, Any]]:
-    """Evaluate one model in closed loop on all tasks of the mix, in the labs of the run; rows as of `evaluate`."""
+    """Evaluate one model in closed loop on all tasks of the run, in its labs; the rows are those of `evaluate`."""
     return evaluate(
         PolicyActor(bundle, config.seed), task_names(config), seeds, image_size=config.image_size,
         labs=labs(config.num_labs), videos_dir=videos_dir, progress=progress,

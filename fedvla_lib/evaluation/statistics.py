@@ -23,7 +23,7 @@ def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
     Raises:
         ValueError: one of them is not in `known`.
     """
-    for metric in metrics:
+    for metric in metrics or [""]:  # none is no choice either
         if metric not in known:
             raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(known)}")
     return list(metrics)
@@ -100,8 +100,8 @@ def _sign_test(each: np.ndarray, seed: int) -> float:
     return float(permutation_test((each,), np.mean, permutation_type="samples", n_resamples=9999, rng=rng).pvalue)
 
 
-def smallest_difference(n: int, discordant: float, confidence: float = CONFIDENCE, power: float = POWER) -> float:
-    """Smallest difference of two success rates that `n` pairs detect with the given power; NaN if there is none.
+def smallest_difference(n: int, discordant: float, confidence: float = CONFIDENCE) -> float:
+    """Smallest difference of two success rates that `n` pairs detect with a power of 80 %; NaN if there is none.
 
     Args:
         discordant: share of pairs with different outcomes.
@@ -109,7 +109,7 @@ def smallest_difference(n: int, discordant: float, confidence: float = CONFIDENC
     Source: Connor 1987, Biometrics 43, eq. 2, solved for the difference d of McNemar's test:
     sqrt(n) d = z_a sqrt(discordant) + z_b sqrt(discordant - d²).
     """
-    z_a, z_b = norm.ppf([1 - (1 - confidence) / 2, power])
+    z_a, z_b = norm.ppf([1 - (1 - confidence) / 2, POWER])
 
     def short(d: float) -> float:
         return z_a * np.sqrt(discordant) + z_b * np.sqrt(max(discordant - d * d, 0)) - np.sqrt(n) * d

@@ -1,4 +1,4 @@
 """What the book compares: methods, grids of them over partitions and seeds, result tables, a hyperparameter search.
 
-May import every room but `cli`. Start reading with `methods`, then `experiment_file` for the grid.
+May import every package but `cli`. Start reading with `methods`, then `experiment_file` for the grid.
 """

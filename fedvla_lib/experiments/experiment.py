@@ -107,7 +107,7 @@ def _exchanged_bytes(replies: pd.DataFrame) -> int:
 
 
 def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
-    """Measure each client's own model on all held-out episodes; the rollouts are dealt out over the clients."""
+    """Measure each client's own model on all held-out episodes; the rollouts are divided among the clients."""
     results, steps, seconds = [], {}, 0.0
     for client in range(config.num_clients):
         began = time.perf_counter()

@@ -14,7 +14,7 @@
     partition = "task"
 
     [methods.fedavg]            # a kind of training and its settings
-    kind = "federated"          # or base; centralized; local-only: each client alone, the rollouts dealt out over them;
+    kind = "federated"          # or base; centralized; local-only: each client alone, the rollouts divided among them;
                                 # or clients: each client's model after a federated run, on the client's tasks
 
     [[only]]                    # optional: keep only cells that match one of these rules

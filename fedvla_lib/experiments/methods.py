@@ -1,6 +1,6 @@
 """The methods that the book compares, on the same data and from the same base.
 
-``base`` is the untrained start; ``local-only`` trains one client on its own episodes; ``federated`` is a federated run
+``base`` is the starting model; ``local-only`` trains one client on its own episodes; ``federated`` is a federated run
 over all clients; ``centralized`` trains on all clients' episodes. *centralized* gets the total gradient steps of the
 federation, *local-only* that total over the number of clients. Results are cached by settings and by the digest of the
 code that determines them, so a change of either trains again.

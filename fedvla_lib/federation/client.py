@@ -108,10 +108,10 @@ class Client:
 
 
 def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, own_data: str = "") -> Client:
-    """Return client `partition_id` with its part of the run's data set, or with all of its own data set.
+    """Return client `partition_id` with its partition of the run's data set, or with all of its own data set.
 
     Args:
-        own_data: folder or hub id of the client's own data set; empty for its part of ``config.data``.
+        own_data: folder or hub id of the client's own data set; empty for its partition of ``config.data``.
 
     Raises:
         ValueError: there is no such partition; the message says what to change.
@@ -128,7 +128,7 @@ def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, o
 
 
 def open_pooled(config: Config, loaders: Loaders = LOADERS, partition_id: int = 0) -> Client:
-    """Return one client that holds all training episodes of a data set: pooled training, or a lab with its own data.
+    """Return one client that holds all training episodes of a data set: centralized training, or a lab with its data.
 
     Its random stream is that of client `partition_id`: with one client, all methods learn the same.
     """

@@ -84,7 +84,7 @@ def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
 def introduce_nodes(
     grid: Grid, nodes: list[int], report: Report, timeout_s: float
 ) -> tuple[Roster, list[Introduction]]:
-    """Ask every node for its partition, frames and statistics; report and leave out nodes whose reply is invalid.
+    """Ask every node for its partition, frame count and statistics; report and skip nodes whose reply is invalid.
 
     Returns the roster, and the introductions ordered by partition.
     """

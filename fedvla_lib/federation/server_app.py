@@ -176,7 +176,7 @@ class GlobalEvaluator:
 
 
 def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
-    """Ask clients for partition, frames and statistics; nothing else about their data leaves them.
+    """Ask clients for partition, frame count and statistics; none of their other data leaves them.
 
     Returns the roster, each node's share of all frames, and the pooled statistics.
     """

@@ -20,7 +20,7 @@ def for_simulation(grid: Grid) -> "Grid | ThrottledGrid":
 
 
 class ThrottledGrid:
-    """Sends a message only when fewer than `limit` are without a reply; delegates everything else to `grid`."""
+    """Sends a message only when fewer than `limit` are unanswered; delegates everything else to `grid`."""
 
     def __init__(self, grid: Grid, limit: int) -> None:
         self._grid, self._limit = grid, limit

@@ -22,7 +22,7 @@ from safetensors import safe_open
 
 from fedvla_lib.config import Config, granted_threads, personal_parts
 from fedvla_lib.data.normalisation import Stats
-from fedvla_lib.files import cache_dir, new_folder
+from fedvla_lib.files import new_folder
 from fedvla_lib.policy.lora import add_adapters, merged
 from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
@@ -112,7 +112,7 @@ def write_policy(bundle: Bundle, folder: Path) -> None:
 def _random_nano(config: Config) -> SmolVLAPolicy:
     """A nano policy with random weights that depend on the seed only."""
     settings = SmolVLAConfig(
-        vlm_model_name=str(ensure_nano(cache_dir(), config.image_size)),
+        vlm_model_name=str(ensure_nano(config.image_size)),
         num_vlm_layers=0,  # 0 keeps all layers the backbone has
         resize_imgs_with_padding=(config.image_size, config.image_size),
         device=config.device,  # otherwise LeRobot looks for an accelerator and logs two warnings

@@ -15,7 +15,7 @@ from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
 from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
 from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
-from fedvla_lib.files import new_folder
+from fedvla_lib.files import cache_dir, new_folder
 
 PACKAGE = "fedvla-lib"
 NANO, NANO_RANDOM = "nano", "nano-random"  # values of Config.base
@@ -38,13 +38,13 @@ CORPUS = [
 ]
 
 
-def ensure_nano(cache: Path, image_size: int) -> Path:
-    """Return the folder under `cache` of the nano backbone for `image_size` pixels; write it if it does not exist.
+def ensure_nano(image_size: int) -> Path:
+    """Return the cached folder of the nano backbone for `image_size` pixels; write it if it does not exist.
 
     Raises:
         ValueError: `image_size` is not a multiple of the number of patches per side.
     """
-    folder = cache / f"nano-vlm-{image_size}"
+    folder = cache_dir() / f"nano-vlm-{image_size}"
     if not (folder / "config.json").exists():
         with new_folder(folder) as draft:
             write_nano(draft, image_size)

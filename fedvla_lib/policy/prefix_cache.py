@@ -89,7 +89,7 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
 
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
     """Return the prefixes of all frames of `store` under this model, computing them into `folder` if needed."""
-    target = folder / f"prefix-{_fingerprint(bundle, store)}"
+    target = folder / _fingerprint(bundle, store)
     if not target.is_dir():
         _fill(bundle, store, target, progress)
     return PrefixStore(np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))

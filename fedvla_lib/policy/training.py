@@ -28,13 +28,7 @@ from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
 Parameters = Mapping[str, torch.nn.Parameter]
 
 
-class Correction(Protocol):
-    """Called with the trainable parameters by name after each backward pass, before gradient clipping."""
-
-    def __call__(self, parameters: Parameters) -> None:
-        """Change the gradients in place."""
-
-
+Correction = Callable[[Parameters], None]  # changes gradients in place, after the backward pass, before clipping
 WEIGHTS_FILE = "trainable.safetensors"
 LOSSES_FILE = "losses.json"
 Loss = Callable[[Bundle, dict[str, Any]], torch.Tensor]  # of a policy on a raw batch
@@ -63,7 +57,7 @@ class TrainResult:
 
 @dataclass(frozen=True)
 class Start:
-    """Position of a call of `local_train` within a longer training."""
+    """Where a call of `local_train` starts in a longer run."""
 
     step: int = 0  # gradient steps of earlier rounds: position in the data and in the learning-rate schedule
     total_steps: int | None = None  # length of the schedule; None ends it with the call
@@ -182,7 +176,7 @@ def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int
 
 
 def learning_rates(bundle: Bundle, config: Config, *, steps: int) -> list[float]:
-    """Return the learning rate of each gradient step of a training of `steps` steps."""
+    """Return the learning rate of each of `steps` gradient steps."""
     _, scheduler = _optimizer(bundle, config, 0, steps)
     return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
 

@@ -138,9 +138,9 @@ def measure(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list
 
 
 def follows_instructions(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list[dict[str, Any]]:
-    """Return success rates in scenes with two cubes when the instruction names the right cube or the other one.
+    """Return success rates in scenes with two cubes when the instruction names the target or the other cube.
 
-    In both cases success refers to the right cube, with the same seeds.
+    In both cases success refers to the target cube, with the same seeds.
     """
     actors = {"right": PolicyActor(bundle, recipe.seed), "other": _Misled(bundle, recipe.seed)}
     rows = []

@@ -14,7 +14,7 @@ import mink
 import numpy as np
 from tqdm import tqdm
 
-from fedvla_lib.robot.layout import CUBE_HALF_M, Cube, Layout
+from fedvla_lib.robot.layout import CUBE_HALF_M, Cube, Layout, cartesian
 from fedvla_lib.robot.rollout import run_episode
 from fedvla_lib.robot.scene import GRASP_SITE, build_arm
 from fedvla_lib.robot.sim import So100Env, from_radians, to_radians
@@ -180,10 +180,10 @@ def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> 
     side = np.sign(bearing_rad - cube_rad)  # 1 sweeps to the left
     beside_rad = cube_rad - side * FORK_GAP_M / cube_radius_m
     yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
-    beside = _cartesian(cube_radius_m, beside_rad)
+    beside = cartesian(cube_radius_m, beside_rad)
     hover = _move(start, (*beside, HOVER_HEIGHT_M), yaw_rad, FORK)
     down = _move(hover, (*beside, PUSH_HEIGHT_M), yaw_rad, FORK)
-    end = _cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
+    end = cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
     return [hover, down, *_arc(down, end, PUSH_HEIGHT_M, FORK)]
 
 
@@ -206,13 +206,13 @@ def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
 def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
     radius_m, bearing_rad = _polar(*layout.cube_xy_m)
-    return path + _arc(path[-1], _cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
+    return path + _arc(path[-1], cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
 
 
 def _pull_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
     radius_m, bearing_rad = _polar(*layout.cube_xy_m)
-    nearer = _cartesian(radius_m - PULL_M, bearing_rad)
+    nearer = cartesian(radius_m - PULL_M, bearing_rad)
     return [*path, _move(path[-1], (*nearer, DRAG_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
 
 
@@ -230,7 +230,7 @@ def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, grippe
     path = []
     for step in range(1, steps + 1):
         progress = _smooth(step / steps)
-        point_m = _cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
+        point_m = cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
         position_m = (*point_m, z + progress * (height_m - z))
         path.append(Waypoint(position_m, begin.yaw_rad + progress * turn_rad, gripper, 1))
     return path
@@ -239,10 +239,6 @@ def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, grippe
 def _polar(x: float, y: float) -> tuple[float, float]:
     """Radius in metres and bearing in radians, around the arm's first joint."""
     return float(np.hypot(x, y)), float(np.arctan2(y, x))
-
-
-def _cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
-    return float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))
 
 
 PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {

@@ -97,4 +97,9 @@ def draw_apart(regions: list[Region], apart_m: float, rng: np.random.Generator) 
 def _draw_point(region: Region, rng: np.random.Generator) -> Point:
     radius_m = rng.uniform(*region.radius_m)
     bearing_rad = np.deg2rad(rng.uniform(*region.bearing_deg))
-    return (float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))), float(bearing_rad)
+    return cartesian(radius_m, bearing_rad), float(bearing_rad)
+
+
+def cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:
+    """Return x and y in metres of a point around the arm's first joint."""
+    return float(radius_m * np.cos(bearing_rad)), float(radius_m * np.sin(bearing_rad))

@@ -14,6 +14,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from fedvla_lib.config import split_names
 from fedvla_lib.robot.sim import ENV_ID
 from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, image_key
 from fedvla_lib.robot.tasks import check_tasks
@@ -54,7 +55,7 @@ class So100SimConfig(EnvConfig):
     @property
     def task_names(self) -> list[str]:
         """The tasks to evaluate."""
-        return [name.strip() for name in self.task.split(",") if name.strip()]
+        return split_names(self.task)
 
     @property
     def gym_id(self) -> str:

@@ -243,7 +243,7 @@ def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
 
 
 def _as_float32(arrays: ArrayRecord | None) -> ArrayRecord | None:
-    """Undo that Flower's adaptive strategies turn arrays into float64."""
+    """Cast back to float32: Flower's adaptive strategies compute in float64."""
     if arrays is None:
         return None
     return ArrayRecord({name: Array(np.asarray(array.numpy(), np.float32)) for name, array in arrays.items()})

@@ -1,4 +1,4 @@
-"""SCAFFOLD: control variates correct the clients' gradients; client's half and server's half."""
+"""SCAFFOLD: control variates correct the clients' gradients; client side and server side."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -55,8 +55,8 @@ class ControlVariates:
 class CheckedScaffold(Checked, FedAvg):
     """SCAFFOLD (Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378): FedAvg with control variates.
 
-    The server keeps c = sum_k p_k c_k over all clients and sends it with the model; `ControlVariates` is the client's
-    half. The paper weighs clients equally; here p_k = n_k / sum n, as in averaging, because otherwise the optimum of
+    The server keeps c = sum_k p_k c_k over all clients and sends it with the model; `ControlVariates` is the client
+    side. The paper weighs clients equally; here p_k = n_k / sum n, as in averaging, because otherwise the optimum of
     the averaged loss would not be a fixed point.
 
     Args:
