@@ -7,7 +7,10 @@ import pytest
 import yaml
 
 import build_book
-from build_book import BookError, Chapter
+import execution
+import front_page
+import pages
+from execution import BookError, Chapter
 from fedvla_book import tables
 from fedvla_lib.experiments import results
 
@@ -46,17 +49,17 @@ def project(tmp_path) -> Path:
 
 @pytest.mark.unit
 def test_key_changes_with_everything_a_chapter_depends_on(project):
-    keys = {build_book.library_key(project, profile) for profile in ("tiny", "laptop")}
+    keys = {execution.library_key(project, profile) for profile in ("tiny", "laptop")}
     for path, text in (("fedvla_lib/robot/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
         (project / path).parent.mkdir(exist_ok=True)
         (project / path).write_text(text)
-        keys.add(build_book.library_key(project, "tiny"))
+        keys.add(execution.library_key(project, "tiny"))
     (project / "fedvla_lib" / "new.py").write_text("")
-    keys.add(build_book.library_key(project, "tiny"))
+    keys.add(execution.library_key(project, "tiny"))
     assert len(keys) == 5
     notebook = project / "notebooks" / "one.ipynb"
-    before = build_book.notebook_key(notebook, "library")
-    assert build_book.notebook_key(write_notebook(notebook, code="1 + 1"), "library") != before
+    before = execution.notebook_key(notebook, "library")
+    assert execution.notebook_key(write_notebook(notebook, code="1 + 1"), "library") != before
 
 
 @pytest.mark.unit
@@ -69,15 +72,15 @@ def test_key_changes_with_the_stored_results_that_a_chapter_reads(project):
     for code in ("1 + 1", "'../book/reference/runs'"):
         write_notebook(notebook, code=code)
         (stored / "a.json").write_text("1")
-        before = build_book.notebook_key(notebook, "library")
+        before = execution.notebook_key(notebook, "library")
         (stored / "a.json").write_text("2")
-        keys[code] = build_book.notebook_key(notebook, "library") != before
+        keys[code] = execution.notebook_key(notebook, "library") != before
     assert list(keys.values()) == [False, True]
 
 
 @pytest.mark.unit
 def test_key_does_not_change_by_itself(project):
-    assert build_book.library_key(project, "tiny") == build_book.library_key(project, "tiny")
+    assert execution.library_key(project, "tiny") == execution.library_key(project, "tiny")
 
 
 @pytest.mark.unit
@@ -86,15 +89,15 @@ def test_one_setting_switches_the_buttons_to_the_source_on(tmp_path, url, button
     config = yaml.safe_load((ROOT / "_config.yml").read_text())
     config["repository"]["url"] = url
     (tmp_path / "_config.yml").write_text(yaml.safe_dump(config))
-    html = yaml.safe_load(build_book._rendering_config(tmp_path))["html"]
+    html = yaml.safe_load(pages._rendering_config(tmp_path))["html"]
     assert {html[f"use_{kind}_button"] for kind in ("edit_page", "repository", "issues")} == {buttons}
 
 
 @pytest.mark.unit
 def test_pages_of_the_real_contents_exist():
-    pages = build_book.toc_pages(ROOT)
-    assert pages[0] == "book/index" and len(pages) == len(set(pages)) > 6
-    assert not [page for page in pages if page.startswith("book/") and not (ROOT / f"{page}.md").is_file()]
+    names = execution.toc_pages(ROOT)
+    assert names[0] == "book/index" and len(names) == len(set(names)) > 6
+    assert not [page for page in names if page.startswith("book/") and not (ROOT / f"{page}.md").is_file()]
 
 
 @pytest.mark.unit
@@ -102,26 +105,26 @@ def test_nested_sections_are_found(tmp_path):
     (tmp_path / "_toc.yml").write_text(
         "format: jb-book\nroot: a\nparts:\n  - chapters:\n      - file: b\n        sections:\n          - file: c\n"
     )
-    assert build_book.toc_pages(tmp_path) == ["a", "b", "c"]
+    assert execution.toc_pages(tmp_path) == ["a", "b", "c"]
 
 
 @pytest.mark.integration
 def test_executes_once_then_only_after_a_change(project, capsys):
     ran, prepared = project / "notebooks" / "ran.txt", []
-    first = build_book.execute_chapters(project, "tiny", prepare=prepared.append)[0]
-    again = build_book.execute_chapters(project, "tiny", prepare=prepared.append)[0]
+    first = execution.execute_chapters(project, "tiny", prepare=prepared.append)[0]
+    again = execution.execute_chapters(project, "tiny", prepare=prepared.append)[0]
     assert prepared == ["tiny"]
     assert (first.reused, again.reused) == (False, True) and again.seconds == pytest.approx(first.seconds, abs=0.1)
     assert ran.read_text() == "tiny\n", "papermill injects the profile, in the notebook's own folder"
     (project / "fedvla_lib" / "spec.py").write_text("FPS = 20\n")
-    assert not build_book.execute_chapters(project, "tiny")[0].reused
+    assert not execution.execute_chapters(project, "tiny")[0].reused
     assert ran.read_text() == "tiny\n" * 2
     assert "unchanged" in capsys.readouterr().out
 
 
 @pytest.mark.integration
 def test_executed_copy_shows_results_but_neither_injection_nor_paths(project):
-    chapter = build_book.execute_chapters(project, "tiny")[0]
+    chapter = execution.execute_chapters(project, "tiny")[0]
     text = chapter.executed.read_text()
     notebook = nbformat.read(chapter.executed, as_version=4)
     assert len(notebook.cells) == 3 and notebook.cells[2].outputs[0].text == "tiny\n"
@@ -132,11 +135,11 @@ def test_executed_copy_shows_results_but_neither_injection_nor_paths(project):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_failing_cell_names_chapter_and_error_and_leaves_no_copy(project, jobs):
     """Also where chapters are executed side by side, in other processes."""
-    (chapter,) = build_book.execute_chapters(project, "tiny", jobs=jobs)
+    (chapter,) = execution.execute_chapters(project, "tiny", jobs=jobs)
     assert nbformat.read(chapter.executed, as_version=4).metadata["fedvla"]["at_a_time"] == jobs
     write_notebook(project / "notebooks" / "one.ipynb", code="raise KeyError('no such episode')")
     with pytest.raises(BookError, match=r"one.ipynb: KeyError: 'no such episode'"):
-        build_book.execute_chapters(project, "tiny", jobs=jobs)
+        execution.execute_chapters(project, "tiny", jobs=jobs)
     assert not (project / "_build" / "tiny" / "executed" / "one.ipynb").exists()
 
 
@@ -151,27 +154,27 @@ def test_chapters_whose_costs_are_printed_are_executed_one_at_a_time(capsys):
 def test_parameter_that_the_chapter_does_not_have(project):
     notebook = write_notebook(project / "notebooks" / "one.ipynb", parameters="size = 3")
     with pytest.raises(BookError, match="one.ipynb has no parameter 'profile'.*'size'"):
-        build_book.check_parameters(notebook, {"profile": "tiny"})
+        execution.check_parameters(notebook, {"profile": "tiny"})
 
 
 @pytest.mark.unit
 def test_no_chapter_of_that_name(project):
     with pytest.raises(BookError, match="no chapter in _toc.yml has 'zero'"):
-        build_book.execute_chapters(project, "tiny", only="zero")
+        execution.execute_chapters(project, "tiny", only="zero")
 
 
 @pytest.mark.unit
 def test_lay_out_touches_only_what_changed(project):
     source = project / "_build" / "tiny" / "source"
     chapter = Chapter("one", project / "notebooks" / "one.ipynb", "key", 12.4, reused=False)
-    digest = build_book.lay_out(project, source, [chapter], "tiny")
-    assert build_book.lay_out(project, source, [chapter], "tiny") == digest
+    digest = pages.lay_out(project, source, [chapter], "tiny")
+    assert pages.lay_out(project, source, [chapter], "tiny") == digest
     times = {path: path.stat().st_mtime_ns for path in source.rglob("*") if path.is_file()}
     assert "execute_notebooks: 'off'" in (source / "_config.yml").read_text()
     assert "[](../notebooks/one.ipynb)" in (source / "book" / "run_times.md").read_text()
     (source / "old.md").write_text("a page of an earlier build")
     (project / "book" / "index.md").write_text("# New front\n")
-    assert build_book.lay_out(project, source, [chapter], "tiny") != digest
+    assert pages.lay_out(project, source, [chapter], "tiny") != digest
     changed = {path.name for path, time in times.items() if path.stat().st_mtime_ns != time}
     assert changed == {"index.md"} and not (source / "old.md").exists()
 
@@ -216,7 +219,7 @@ def test_publishing_replaces_the_whole_book(tmp_path):
 def test_warnings_of_the_book_are_errors(project, capfd):
     (project / "book" / "index.md").write_text("# Front\n\nSee {doc}`nowhere`.\n")
     source = project / "_build" / "tiny" / "source"
-    build_book.lay_out(project, source, [], "tiny")
+    pages.lay_out(project, source, [], "tiny")
     with pytest.raises(BookError, match="warnings above, which are errors"):
         build_book.render(source, project / "_build" / "tiny")
     assert "nowhere" in capfd.readouterr().err
@@ -232,37 +235,37 @@ def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
     output = nbformat.v4.new_output("display_data", {"text/html": f"<div>{html}</div>"})
     cell = nbformat.v4.new_code_cell("show", outputs=[output])
     nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "videos.ipynb")
-    said = build_book._video(tmp_path / "videos.ipynb", "tiny")
+    said = front_page.video(tmp_path / "videos.ipynb", "tiny")
     assert said.startswith(figure(10, "failed") + "\n\n") and "profile `tiny`" in said
     nbformat.write(nbformat.v4.new_notebook(), tmp_path / "videos.ipynb")
     with pytest.raises(BookError, match="videos.ipynb shows no video"):
-        build_book._video(tmp_path / "videos.ipynb", "tiny")
-    assert build_book.VIDEO in (ROOT / build_book.FRONT_PAGE).read_bytes()
+        front_page.video(tmp_path / "videos.ipynb", "tiny")
+    assert pages.VIDEO in (ROOT / pages.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
 def test_the_front_page_says_what_the_stored_comparison_found():
-    stored = results.read_results(ROOT / build_book.COMPARISON)
+    stored = results.read_results(ROOT / front_page.COMPARISON)
     rows = stored[(stored.partition == "task") & (stored.method == "fedavg-200x2x2")]
-    said = build_book._headline(ROOT / build_book.COMPARISON)
+    said = front_page.headline(ROOT / front_page.COMPARISON)
     assert f"the success rate of the federated model is {100 * rows.success.mean():.1f} % [" in said
     assert f"over {len(rows):,} rollouts and {rows.run.nunique()} training seeds" in said
     in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
     assert f"After {in_all} gradient steps in total" in said and f"took {in_a_row} sequential steps" in said
-    assert set(stored.partition) <= set(build_book.DEALT)
+    assert set(stored.partition) <= set(front_page.DEALT)
     gaps = tables.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
     for gap in gaps.itertuples():  # every partition that has both
-        words = f"{build_book.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
+        words = f"{front_page.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
         assert words in said.split("Federated minus centralized: ")[1].split("\n")[0]
     assert said.count(" points [") == len(gaps) + 1  # and federated minus labs alone, at their own tasks
-    assert build_book.HEADLINE in (ROOT / build_book.FRONT_PAGE).read_bytes()
+    assert pages.HEADLINE in (ROOT / pages.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
 def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_evaluated():
-    stored = results.read_results(ROOT / build_book.COMPARISON)
+    stored = results.read_results(ROOT / front_page.COMPARISON)
     stored = stored[stored.partition == "task"]
-    said = build_book._headline(ROOT / build_book.COMPARISON)
+    said = front_page.headline(ROOT / front_page.COMPARISON)
     share, longer = (stored[stored.method == method] for method in ("local-only", "local-only-800"))
     steps = {method: part.steps_in_all.unique().item() for method, part in (("share", share), ("longer", longer))}
     assert f"alone for its share of the steps, {steps['share']}, reaches {100 * share.success.mean():.1f} % [" in said
@@ -282,15 +285,15 @@ def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_eval
 @pytest.mark.unit
 def test_the_front_page_draws_each_method_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
     drawn = []
-    draw = build_book.plots.success_intervals
+    draw = front_page.plots.success_intervals
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
-    monkeypatch.setattr(build_book.plots, "success_intervals", keep)
-    image = build_book._outcome(ROOT / build_book.COMPARISON)
-    assert image.startswith(b"\x89PNG") and image == build_book._outcome(ROOT / build_book.COMPARISON)
+    monkeypatch.setattr(front_page.plots, "success_intervals", keep)
+    image = front_page.outcome(ROOT / front_page.COMPARISON)
+    assert image.startswith(b"\x89PNG") and image == front_page.outcome(ROOT / front_page.COMPARISON)
     rows = [label.get_text() for label in drawn[0].get_yticklabels()]
     assert {"local-only, own task, 80 steps", "local-only, other tasks, 80 steps", "centralized, 800 steps",
             "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(rows)  # fmt: skip
-    assert build_book.OUTCOME.removeprefix("book/") in build_book._headline(ROOT / build_book.COMPARISON)
+    assert front_page.OUTCOME.removeprefix("book/") in front_page.headline(ROOT / front_page.COMPARISON)
 
 
 @pytest.mark.unit
@@ -299,6 +302,6 @@ def test_the_front_page_is_not_built_over_methods_that_took_other_steps(monkeypa
     longer = lambda folder: (rows := read(folder)).assign(  # noqa: E731
         steps_in_all=rows.steps_in_all.where(rows.method != "centralized", rows.steps_in_all + 1)
     )
-    monkeypatch.setattr(build_book.results, "read_results", longer)
+    monkeypatch.setattr(front_page.results, "read_results", longer)
     with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in total steps"):
-        build_book._headline(ROOT / build_book.COMPARISON)
+        front_page.headline(ROOT / front_page.COMPARISON)

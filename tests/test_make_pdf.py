@@ -5,9 +5,10 @@ import zlib
 from pathlib import Path
 
 import pytest
+import yaml
 
-import build_book
 import check_site
+import execution
 import make_pdf
 from test_build_book import project  # noqa: F401 - a fixture
 
@@ -39,7 +40,7 @@ def test_a_chapter_begins_a_page_and_a_short_cell_stays_on_one(tmp_path):
 
 @pytest.mark.unit
 def test_chapters_that_were_not_executed_are_named(project):  # noqa: F811
-    with pytest.raises(build_book.BookError, match="profile tiny.*: one; run make book"):
+    with pytest.raises(execution.BookError, match="profile tiny.*: one; run make book"):
         make_pdf.executed_chapters(project, "tiny")
 
 
@@ -47,7 +48,7 @@ def test_chapters_that_were_not_executed_are_named(project):  # noqa: F811
 def test_all_pages_become_one(project: Path, tmp_path):  # noqa: F811
     """With a drop-down and an exercise, whose extensions know the single page only with site_scripts."""
     config = {"extra_extensions": ["sphinx_exercise", "site_scripts"]}
-    (project / "_config.yml").write_text(build_book.yaml.safe_dump({"title": "A book", "sphinx": config}))
+    (project / "_config.yml").write_text(yaml.safe_dump({"title": "A book", "sphinx": config}))
     text = "# Front\n\n```{exercise}\nThink.\n```\n\n```{dropdown} Solution\nDone.\n```\n"
     (project / "book" / "index.md").write_text(text)
     (project / "_toc.yml").write_text("format: jb-book\nroot: book/index\nchapters:\n  - file: book/run_times\n")

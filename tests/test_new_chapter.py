@@ -11,7 +11,7 @@ import pytest
 import new_chapter
 import test_exercises
 import test_notebooks
-from build_book import toc_pages
+from execution import toc_pages
 
 ROOT = Path(__file__).parents[1]
 NAME = "97_made_by_a_test"

@@ -7,7 +7,7 @@ import nbformat
 import papermill
 import pytest
 
-import build_book
+import execution
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parent.parent
@@ -59,7 +59,7 @@ INSIDE = {
 
 
 def test_the_contents_list_every_chapter_and_no_other():
-    listed = [page for page in build_book.toc_pages(ROOT) if page.startswith("notebooks/")]
+    listed = [page for page in execution.toc_pages(ROOT) if page.startswith("notebooks/")]
     assert listed == [f"notebooks/{path.stem}" for path in NOTEBOOKS]
 
 

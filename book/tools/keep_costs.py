@@ -14,7 +14,7 @@ from pathlib import Path
 
 import nbformat
 
-from build_book import toc_pages
+from execution import toc_pages
 from fedvla_book.chapter_cost import MEASURED
 from fedvla_lib.config import PROFILES
 from fedvla_lib.files import write_json

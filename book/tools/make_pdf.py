@@ -14,8 +14,9 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-from build_book import CELL_TIMEOUT_S, BookError, Chapter, lay_out, library_key, reuse, toc_pages
 from check_site import FLAGS, _chromium
+from execution import CELL_TIMEOUT_S, BookError, Chapter, library_key, reuse, toc_pages
+from pages import lay_out
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "_build/fedvla-book.pdf"

@@ -1,0 +1,231 @@
+"""Execute the chapters that changed, and find the executed copies again.
+
+Jupyter Book's execution cache ignores changes of the library. Here a chapter is executed again if its key changes,
+which covers notebook, library, requirements.lock and profile. papermill executes it with the profile as parameter.
+"""
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import papermill
+import yaml
+from papermill.exceptions import PapermillExecutionError
+
+import status
+
+PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
+REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
+CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
+
+
+class BookError(ValueError):
+    """The book cannot be built; the message is one line and names the chapter or page."""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One executed notebook: its file, key and execution time."""
+
+    name: str
+    executed: Path
+    key: str
+    seconds: float
+    reused: bool
+
+
+def library_key(root: Path, profile: str) -> str:
+    """Return a digest of all that a chapter's results depend on, except the notebook."""
+    packages = [path for name in PACKAGES for path in (root / name).rglob("*") if "__pycache__" not in path.parts]
+    files = [*sorted(packages), root / "requirements.lock"]
+    return digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
+
+
+def notebook_key(notebook: Path, library: str) -> str:
+    """Return the digest of `notebook`, the library and the stored results that it reads."""
+    source = notebook.read_bytes()
+    folders = sorted({notebook.parent / name.decode() for name in REFERENCE.findall(source)})
+    files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
+    stored = [_named_bytes(notebook.parent.parent, path.resolve()) for path in files]
+    return digest([library.encode(), notebook.name.encode(), source, *stored])
+
+
+def _named_bytes(root: Path, path: Path) -> bytes:
+    return path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes()
+
+
+def digest(parts: Iterable[bytes]) -> str:
+    """Return the digest of a list of contents."""
+    whole = hashlib.sha256()
+    for part in parts:
+        whole.update(hashlib.sha256(part).digest())  # of fixed length, so that no two lists collide
+    return whole.hexdigest()
+
+
+def toc_pages(root: Path) -> list[str]:
+    """Return the pages of the table of contents, in order and without suffix."""
+    toc = yaml.safe_load((root / "_toc.yml").read_text(encoding="utf-8"))
+    return [toc["root"], *_files_under({key: value for key, value in toc.items() if key != "root"})]
+
+
+def _files_under(node: object) -> list[str]:
+    if isinstance(node, list):
+        return [name for item in node for name in _files_under(item)]
+    if not isinstance(node, dict):
+        return []
+    own = [node["file"]] if "file" in node else []
+    return own + [name for value in node.values() for name in _files_under(value)]
+
+
+def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
+    """Raise BookError if the parameters cell of `notebook` lacks a parameter; papermill only warns."""
+    known = papermill.inspect_notebook(str(notebook))
+    for name in parameters:
+        if name not in known:
+            raise BookError(f"{notebook.name} has no parameter {name!r}: its parameters cell has {sorted(known)}")
+
+
+def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
+    """Return the executed copy of `notebook` in `folder` if its key is unchanged, else None."""
+    target, key = folder / notebook.name, notebook_key(notebook, library)
+    if not target.is_file() or (stamp := _stamp(target)).get("key") != key:
+        return None
+    return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
+
+
+def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time: int = 1) -> Chapter:
+    """Execute `notebook` with `profile` and write the executed copy to `folder`.
+
+    Args:
+        at_a_time: number of chapters executed in parallel, for the status page.
+
+    Raises:
+        BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
+    """
+    target, key = folder / notebook.name, notebook_key(notebook, library)
+    parameters = {"profile": profile}
+    check_parameters(notebook, parameters)
+    environment = status.environment(notebook, profile)
+    seconds = _execute(notebook, target, parameters)
+    cost = {"seconds": round(seconds, 1), "at_a_time": at_a_time}
+    _finish(target, {"key": key, "profile": profile, **cost, "environment": environment})
+    return Chapter(notebook.stem, target, key, seconds, reused=False)
+
+
+def _stamp(executed: Path) -> dict:
+    return nbformat.read(executed, as_version=4).metadata.get("fedvla", {})
+
+
+def _execute(notebook: Path, target: Path, parameters: dict[str, object]) -> float:
+    """Run `notebook` in its folder, as nbmake and readers do; return the wall time in seconds."""
+    start = time.monotonic()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        papermill.execute_notebook(
+            str(notebook),
+            str(_unfinished(target)),
+            parameters=parameters,
+            cwd=str(notebook.parent),
+            kernel_name="python3",
+            progress_bar=sys.stderr.isatty(),
+            execution_timeout=CELL_TIMEOUT_S[str(parameters["profile"])],
+            extra_arguments=["--log-level=CRITICAL"],  # silences log messages of kernels; cells still show errors
+        )
+    except PapermillExecutionError as error:
+        copy = os.path.relpath(_unfinished(target))
+        raise BookError(f"{notebook.name}: {error.ename}: {error.evalue.strip()} (see {copy})") from error
+    return time.monotonic() - start
+
+
+def _unfinished(target: Path) -> Path:
+    return target.with_name(f"{target.stem}.unfinished.ipynb")
+
+
+def _finish(target: Path, stamp: dict[str, object]) -> None:
+    """Turn papermill's output into the rendered copy, without the injected cell and local paths."""
+    notebook = nbformat.read(_unfinished(target), as_version=4)
+    notebook.cells = [cell for cell in notebook.cells if "injected-parameters" not in cell.metadata.get("tags", [])]
+    notebook.metadata.pop("papermill", None)
+    for cell in notebook.cells:
+        cell.metadata.pop("papermill", None)
+    notebook.metadata["fedvla"] = stamp
+    nbformat.write(notebook, _unfinished(target))
+    os.replace(_unfinished(target), target)
+
+
+def execute_chapters(
+    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None, jobs: int = 1
+) -> list[Chapter]:
+    """Execute the changed chapters of the table of contents whose name contains `only`, and print their times.
+
+    Args:
+        prepare: called with the profile if any chapter has to be executed, before the first.
+        jobs: number of chapters executed in parallel; each then takes longer than alone.
+    """
+    library, folder = library_key(root, profile), root / "_build" / profile / "executed"
+    notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file() and only in page]
+    if not notebooks:
+        raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
+    chapters = {path: reuse(path, folder, library) for path in notebooks}
+    if not all(chapters.values()):
+        prepare(profile)
+    place = {path: f"[{number}/{len(notebooks)}] {path.stem}" for number, path in enumerate(notebooks, start=1)}
+    order = notebooks if jobs == 1 else notebooks[::-1]  # the last chapters take longest, so start them first
+    with _workers(jobs) as submit:
+        changed = [path for path in order if chapters[path] is None]
+        lines = {path: f"{place[path]}, profile {profile} ..." for path in changed}
+        work = {path: submit(_announced, lines[path], path, folder, profile, library, jobs) for path in changed}
+        for path in order:
+            chapters[path] = chapters[path] or work[path]()
+            print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
+    return list(chapters.values())
+
+
+def _announced(line: str, notebook: Path, *options: Any) -> Chapter:
+    print(line, flush=True)
+    return execute(notebook, *options)
+
+
+def _on_one_thread() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # inherited by the kernels
+
+
+@contextmanager
+def _workers(jobs: int) -> Iterator[Callable[..., Callable[[], Chapter]]]:
+    """Yield a function that submits work and returns a function for its result.
+
+    With one job the work runs here when its result is requested. Otherwise it starts at once in other processes:
+    papermill changes the working directory, which threads share.
+    """
+    if jobs == 1:
+        yield partial
+        return
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _on_one_thread)
+    try:
+        yield lambda *work: pool.submit(*work).result
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def record_data(profile: str) -> None:
+    """Record the demonstrations that the chapters share, so that it does not count in a chapter's time."""
+    command = [sys.executable, "-m", "fedvla_lib.cli", "record", "--profile", profile]
+    if subprocess.run(command, check=False).returncode:
+        raise BookError("the demonstrations could not be recorded")
+
+
+def _cost(chapter: Chapter) -> str:
+    return f"unchanged, took {chapter.seconds:.0f} s" if chapter.reused else f"executed in {chapter.seconds:.0f} s"
