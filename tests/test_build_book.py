@@ -247,7 +247,7 @@ def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
 def test_the_front_page_says_what_the_stored_comparison_found():
     stored = results.read_results(ROOT / front_page.COMPARISON)
     rows = stored[(stored.partition == "task") & (stored.method == "fedavg-200x2x2")]
-    said = front_page.headline(ROOT / front_page.COMPARISON)
+    said = front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))
     assert f"the success rate of the federated model is {100 * rows.success.mean():.1f} % [" in said
     assert f"over {len(rows):,} rollouts and {rows.run.nunique()} training seeds" in said
     in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
@@ -265,7 +265,7 @@ def test_the_front_page_says_what_the_stored_comparison_found():
 def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_evaluated():
     stored = results.read_results(ROOT / front_page.COMPARISON)
     stored = stored[stored.partition == "task"]
-    said = front_page.headline(ROOT / front_page.COMPARISON)
+    said = front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))
     share, longer = (stored[stored.method == method] for method in ("local-only", "local-only-800"))
     steps = {method: part.steps_in_all.unique().item() for method, part in (("share", share), ("longer", longer))}
     assert f"alone for its share of the steps, {steps['share']}, reaches {100 * share.success.mean():.1f} % [" in said
@@ -285,15 +285,16 @@ def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_eval
 @pytest.mark.unit
 def test_the_front_page_draws_each_method_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
     drawn = []
+    compared = front_page.compared(ROOT / front_page.COMPARISON)
     draw = front_page.plots.success_intervals
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
     monkeypatch.setattr(front_page.plots, "success_intervals", keep)
-    image = front_page.outcome(ROOT / front_page.COMPARISON)
-    assert image.startswith(b"\x89PNG") and image == front_page.outcome(ROOT / front_page.COMPARISON)
+    image = front_page.outcome(compared)
+    assert image.startswith(b"\x89PNG") and image == front_page.outcome(compared)
     rows = [label.get_text() for label in drawn[0].get_yticklabels()]
     assert {"local-only, own task, 80 steps", "local-only, other tasks, 80 steps", "centralized, 800 steps",
             "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(rows)  # fmt: skip
-    assert front_page.OUTCOME.removeprefix("book/") in front_page.headline(ROOT / front_page.COMPARISON)
+    assert front_page.OUTCOME.removeprefix("book/") in front_page.headline(compared)
 
 
 @pytest.mark.unit
@@ -304,4 +305,4 @@ def test_the_front_page_is_not_built_over_methods_that_took_other_steps(monkeypa
     )
     monkeypatch.setattr(front_page.results, "read_results", longer)
     with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in total steps"):
-        front_page.headline(ROOT / front_page.COMPARISON)
+        front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))

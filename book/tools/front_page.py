@@ -37,13 +37,17 @@ def video(chapter: Path, profile: str) -> str:
     )
 
 
-def headline(comparison: Path) -> str:
+def compared(folder: Path) -> pd.DataFrame:
+    """Return the rollouts of the stored comparison; those of a method without partition stand in each partition."""
+    return tables.repeat_partition_free(results.read_results(folder))
+
+
+def headline(rows: pd.DataFrame) -> str:
     """The result of the stored comparison for the front page: one sentence per line, and a figure.
 
     Raises:
         BookError: federated and centralized training differ in total steps, which makes the first sentence wrong.
     """
-    rows = tables.repeat_partition_free(results.read_results(comparison))
     of_task = rows[rows.partition == "task"]
     of_method = results.summary(of_task).set_index("method")
     labs, tasks = of_task.client.nunique(), of_task.task.nunique()
@@ -125,9 +129,8 @@ def _outcome_figure(of_method: pd.DataFrame) -> str:
     )
 
 
-def outcome(comparison: Path) -> bytes:
+def outcome(rows: pd.DataFrame) -> bytes:
     """The figure below the headline, as PNG."""
-    rows = tables.repeat_partition_free(results.read_results(comparison))
     plots.use_style()
     axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="method")
     with tempfile.TemporaryDirectory() as folder:

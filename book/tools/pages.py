@@ -10,7 +10,7 @@ import yaml
 import library
 import status
 from execution import Chapter, digest
-from front_page import COMPARISON, OUTCOME, VIDEO_CHAPTER, headline, outcome, video
+from front_page import COMPARISON, OUTCOME, VIDEO_CHAPTER, compared, headline, outcome, video
 
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
 STATUS_PAGE = "book/run_times.md"
@@ -53,8 +53,9 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     _put(wanted, STATUS_PAGE, STATUS, lambda: status.status(root, executed.values(), profile))
     _put(wanted, FRONT_PAGE, VIDEO, lambda: video(executed[VIDEO_CHAPTER], profile))
     if HEADLINE in wanted.get(Path(FRONT_PAGE), b""):
-        wanted[Path(OUTCOME)] = outcome(root / COMPARISON)
-    _put(wanted, FRONT_PAGE, HEADLINE, lambda: headline(root / COMPARISON))
+        rows = compared(root / COMPARISON)
+        _put(wanted, FRONT_PAGE, HEADLINE, lambda: headline(rows))
+        wanted[Path(OUTCOME)] = outcome(rows)
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
     wanted |= _library_pages(root, wanted, executed.values())
@@ -66,7 +67,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
         path.unlink()
     parts = [path.as_posix().encode() + b"\0" + content for path, content in sorted(wanted.items())]
-    return digest([Path(__file__).read_bytes(), *parts])
+    tools = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]  # what renders, too
+    return digest([*tools, *parts])
 
 
 def _put(wanted: dict[Path, bytes], page: str, mark: bytes, text: Callable[[], str]) -> None:
