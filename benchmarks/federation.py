@@ -14,11 +14,12 @@ from pathlib import Path
 from flwr.app import Context, Message
 from flwr.clientapp import ClientApp
 
+from fedvla_book.chapter_cost import peak_memory_mb
 from fedvla_lib.config import Config
 from fedvla_lib.engines import inline
 from fedvla_lib.federation import client, client_app
 from fedvla_lib.run_folder import read_metrics
-from report import laptop, options, peak_memory_mb, recording, report, start, timed
+from report import laptop, options, recording, report, start, timed
 
 
 def main() -> None:

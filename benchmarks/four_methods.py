@@ -2,8 +2,8 @@
 
 A seed fixes the partition, the clients drawn, noise and batches; the demonstrations are always the same. The best
 client of a run is selected on the same rollouts, which favours it. A client alone takes its share of the gradient
-steps, so its rate is what it gets at an equal total, not what it can reach. Finished seeds are
-kept and not measured again.
+steps, so its rate is what it gets at an equal total, not what it can reach. The steps in the table are those planned
+by the settings. Finished seeds are kept and not measured again.
 
     python benchmarks/four_methods.py
 """
@@ -16,7 +16,7 @@ from dataclasses import replace
 import pandas as pd
 
 from fedvla_book.tables.grids import paired_difference
-from fedvla_lib.config import Config, task_names
+from fedvla_lib.config import Config, granted_cores, task_names
 from fedvla_lib.data import recordings
 from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.evaluation.statistics import success_table
@@ -24,10 +24,10 @@ from fedvla_lib.experiments import methods
 from fedvla_lib.files import write_json
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle
-from report import cores, laptop, options, report, start
+from report import laptop, options, report, start
 
 STARTS_FROM = FIRST_SEED + 1000  # other starting positions than the chapters
-BEST = "best client alone"
+BEST, EVERY = ALONE = ("best client alone", "all clients alone")
 
 
 def main() -> None:
@@ -35,12 +35,12 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the runs")
     parser.add_argument("--rollouts", type=int, default=20, help="rollouts per task, model and seed")
-    parser.add_argument("--threads", type=int, default=cores(), help="threads per model")
+    parser.add_argument("--threads", type=int, default=granted_cores(), help="threads per model")
     chosen = parser.parse_args()
     recording = recordings.resolve(laptop(chosen.profile))
     config = laptop(chosen.profile, num_threads=chosen.threads, data=str(recording))
     rows = pd.concat([one_seed(config, seed, chosen) for seed in chosen.seeds], ignore_index=True)
-    report("four_methods", summary(rows), chosen.out)
+    report("four_methods", summary(rows, config), chosen.out)
 
 
 def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
@@ -51,7 +51,6 @@ def one_seed(config: Config, seed: int, chosen: Namespace) -> pd.DataFrame:
     if not file.is_file():
         starts = rollout_seeds(chosen.rollouts, first=STARTS_FROM)
         rows = [row for name, bundle in models(config) for row in rollouts(name, bundle, config, starts)]
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, rows)
     return pd.DataFrame(json.loads(file.read_text())).assign(run=seed)
 
@@ -70,20 +69,29 @@ def models(config: Config) -> Iterator[tuple[str, Bundle]]:
         yield f"client_{client} alone", methods.local_only(config, client)
 
 
-def summary(rows: pd.DataFrame) -> list[dict[str, object]]:
-    """Return a row per method: successes with interval, and federated's lead on the same rollouts."""
+def planned_steps(config: Config) -> dict[str, tuple[int, int]]:
+    """Return for each method the gradient steps of one of its models that the settings plan: in all and in a row."""
+    total, alone = methods.total_steps(config), methods.steps_per_client(config)
+    federated = (total, methods.steps_in_a_row(config))
+    return {"federated": federated, "centralized": (total, total)} | dict.fromkeys(ALONE, (alone, alone))
+
+
+def summary(rows: pd.DataFrame, config: Config) -> list[dict[str, object]]:
+    """Return a row per method: steps, successes with interval, and federated's lead on the same rollouts."""
     alone = rows[rows.method.str.endswith(" alone")]
     best = pd.concat(
         [part[part.method == part.groupby("method").success.sum().idxmax()] for _, part in alone.groupby("run")]
     )
     counted = {"federated": rows[rows.method == "federated"], "centralized": rows[rows.method == "centralized"]}
-    counted |= {BEST: best, "all clients alone": alone}
-    table = []
+    counted |= {BEST: best, EVERY: alone}
+    table, steps = [], planned_steps(config)
     for name, part in counted.items():
         (line,) = success_table(part.assign(method=name), ["method"]).to_dict("records")
         table.append(
             {
                 "method": name,
+                "steps of a model (by the settings)": steps[name][0],
+                "of them in a row": steps[name][1],
                 "runs": int(part.run.nunique()),
                 "rollouts": int(line["n"]),
                 "successes": int(line["successes"]),

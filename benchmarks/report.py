@@ -6,9 +6,7 @@ the ratio; other load does not, so run nothing else.
 
 import argparse
 import json
-import os
 import platform
-import resource
 import statistics
 import sys
 import time
@@ -16,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fedvla_lib.cli.main import EXPECTED
-from fedvla_lib.config import Config, from_profile
+from fedvla_lib.config import PROFILES, Config, from_profile, granted_cores
 from fedvla_lib.data import recordings
 from fedvla_lib.data.frame_store import FrameStore, open_store
 from fedvla_lib.files import write_json
@@ -27,7 +25,7 @@ RESULTS = Path(__file__).parent / "results"
 def options(text: str) -> argparse.ArgumentParser:
     """Return a parser with the options of all benchmarks."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--profile", default="laptop", help="profile of model and data")
+    parser.add_argument("--profile", default="laptop", choices=list(PROFILES), help="profile of model and data")
     parser.add_argument("--repeats", type=int, default=5, help="measurements on each side; the median is reported")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the JSON file")
     return parser
@@ -64,27 +62,15 @@ def timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def peak_memory_mb() -> float:
-    """Return this process's peak memory in MB (`ru_maxrss` is in KiB on Linux, in bytes on macOS)."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if platform.system() == "Darwin" else 1e3)
-
-
 def report(name: str, rows: list[dict[str, object]], out: Path) -> None:
     """Print the rows and write them with a description of the machine to `out/name.json`."""
     for row in rows:
         print("  ".join(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"
                         for key, value in row.items()))  # fmt: skip
-    out.mkdir(parents=True, exist_ok=True)
     write_json(out / f"{name}.json", {"machine": machine(), "rows": json.loads(json.dumps(rows))})
     print(f"-> {name}.json")
 
 
 def machine() -> dict[str, object]:
     """Return the description of the machine stored with results."""
-    return {"cores": cores(), "python": platform.python_version(), "system": platform.system()}
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {"cores": granted_cores(), "python": platform.python_version(), "system": platform.system()}

@@ -19,12 +19,12 @@ from typing import Any
 
 import torch
 
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, granted_cores
 from fedvla_lib.evaluation import rollouts
 from fedvla_lib.evaluation.rollouts import FIRST_SEED
 from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
-from report import cores, laptop, options, report, start, timed
+from report import laptop, options, report, start, timed
 
 VIDEOS = 10  # fixed in lerobot-eval
 AS_LEROBOT = "as-lerobot-eval"  # first argument with which this script calls itself to run lerobot-eval
@@ -53,7 +53,7 @@ def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float,
         theirs_s, successes = lerobot_eval(chosen, config, Path(folder), own_processes)
     return {
         "lerobot-eval's environments": "a process each" if own_processes else "in its own process",
-        "its cores": cores() if own_processes else 1,
+        "its cores": granted_cores() if own_processes else 1,
         "task": chosen.task,
         "rollouts": chosen.rollouts,
         "ours, one core [1/min]": 60 * chosen.rollouts / ours_s,

@@ -46,7 +46,7 @@ def write_site(folder: Path, pages: dict[str, str]) -> Path:
 def found(tmp_path_factory) -> dict[str, list[str]]:
     """What the check says of a site with sound and wrong pages."""
     try:
-        check_site._chromium()
+        check_site.chromium()
     except ValueError as error:
         pytest.skip(str(error))
     pages = {name: content for name, (content, _) in WRONG.items()}

@@ -62,6 +62,9 @@ def executed(folder, name, *, built=True, said=True):
 def test_what_a_build_measured_is_kept_and_shown(tmp_path):
     chapters = "".join(f"- file: notebooks/{name}\n" for name in ("01_a", "02_b"))
     (tmp_path / "_toc.yml").write_text(f"format: jb-book\nroot: a\nchapters:\n{chapters}")
+    (tmp_path / "notebooks").mkdir()
+    for name in ("01_a", "02_b"):
+        (tmp_path / "notebooks" / f"{name}.ipynb").touch()
     folder = tmp_path / "_build" / "tiny" / "executed"
     executed(folder, "01_a")
     with pytest.raises(ValueError, match=r"not executed at profile tiny: 02_b"):

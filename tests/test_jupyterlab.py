@@ -86,7 +86,7 @@ def open_chapter(page: Page, address: str) -> None:
 
 def test_a_chapter_opens_reads_and_runs(lab, chapter):
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=check_site._chromium(), args=check_site.FLAGS)
+        browser = playwright.chromium.launch(executable_path=check_site.chromium(), args=check_site.FLAGS)
         page = browser.new_page()
         open_chapter(page, lab)
         shown = page.locator(".jp-Notebook").inner_text()

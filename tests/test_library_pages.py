@@ -66,7 +66,8 @@ def test_a_described_function_links_to_its_chapter_and_its_room_and_equations_ha
     tree = {"evaluation.video": library.modules(ROOT)["evaluation.video"]}
     described = library.reference(tree, library.rooms(ROOT))
     (tmp_path / "index.md").write_text(f"# Functions\n\n$$ a = 1 $$\n\n$$\nb = 2\n$$\n\n{described}")
-    house = f"---\norphan: true\n---\n# House\n\n## Rooms\n\n{library.table(ROOT, {})}"
+    table = library.table(library.modules(ROOT), library.rooms(ROOT), {})
+    house = f"---\norphan: true\n---\n# House\n\n## Rooms\n\n{table}"
     (tmp_path / "architecture.md").write_text(house)
     (tmp_path / "notebooks" / "one.md").write_text("---\norphan: true\n---\n# The chapter\n")
     (tmp_path / "conf.py").write_text(
@@ -97,7 +98,7 @@ def test_every_documented_module_has_a_section_and_a_row_in_its_room():
     sections = set(re.findall(r"automodule:: fedvla_lib\.([\w.]+)", library.reference(trees, rooms)))
     assert {"policy.model", "engines.inline", "federation.strategies.scaffold", "config"} <= sections <= set(trees)
     used = {"fedvla_lib.policy.model.load_policy": ["03_local_training"]}
-    page = library.table(ROOT, used)
+    page = library.table(trees, rooms, used)
     assert re.findall(r"^\(room-(\w+)\)=$", page, re.M) == [library.ROOT_FILES, *(r for r in rooms if "." not in r)]
     rows = re.findall(r"^\| `.*", page, re.M)
     assert len(rows) == len(trees)

@@ -19,7 +19,7 @@ PAGE = """<!DOCTYPE html><html lang="en"><title>A page</title><h1>A page</h1>
 @pytest.mark.integration
 def test_a_page_is_printed_with_what_folds_out(tmp_path):
     try:
-        check_site._chromium()
+        check_site.chromium()
     except ValueError as error:
         pytest.skip(str(error))
     (tmp_path / "page.html").write_text(PAGE)

@@ -49,7 +49,7 @@ def spent(seconds: float, profile: str | None, seed: int, folders: Iterable[str 
     logs = {path.resolve() for folder in folders for path in Path(folder).rglob("metrics.jsonl")}
     exchanged = sum(_exchanged(path.parent) for path in logs)
     used = profile or os.environ.get("FEDVLA_PROFILE", "laptop")
-    return Spent(used, seed, round(seconds, 1), round(_peak_memory_mb(), 1), round(exchanged / 1e6, 2))
+    return Spent(used, seed, round(seconds, 1), round(peak_memory_mb(), 1), round(exchanged / 1e6, 2))
 
 
 def _exchanged(run: Path) -> int:
@@ -57,7 +57,8 @@ def _exchanged(run: Path) -> int:
     return int(replies[["sent_bytes", "received_bytes"]].to_numpy().sum()) if len(replies) else 0
 
 
-def _peak_memory_mb() -> float:
+def peak_memory_mb() -> float:
+    """Return this process's peak memory in MB."""
     status = Path("/proc/self/status")
     if status.exists():  # Linux, whose getrusage includes the parent process before exec
         return int(re.search(r"VmHWM:\s*(\d+) kB", status.read_text())[1]) * 1024 / 1e6

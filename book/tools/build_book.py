@@ -14,8 +14,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-from execution import CELL_TIMEOUT_S, BookError, execute_chapters, record_data, toc_pages
+from execution import BookError, add_profile, execute_chapters, record_data, toc_pages
 from pages import lay_out
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,19 +25,20 @@ BUILT_FROM = ".built-from"  # file next to the pages with the digest of their so
 
 def render(source: Path, output: Path) -> Path:
     """Build the HTML book with warnings as errors and return the folder of its pages."""
-    # In a subprocess: Sphinx patches docutils globally and changes sys.path.
-    command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
-    options = ["-W", "-n", "--keep-going", "--quiet"]
-    # For site_scripts.py and the documented packages.
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")]),
-    }
     # Warnings are on stderr.
-    built = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, env=environment, check=False)
+    built = jupyter_book(source, output, "-W", "-n", "--keep-going", stdout=subprocess.DEVNULL)
     if built.returncode:
         raise BookError("jupyter-book reported the warnings above, which are errors")
     return output / "_build" / "html"
+
+
+def jupyter_book(source: Path, output: Path, *options: str, **streams: Any) -> subprocess.CompletedProcess:
+    """Run `jupyter-book build`, in a subprocess: Sphinx patches docutils globally and changes sys.path."""
+    command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
+    # For site_scripts.py and the documented packages.
+    path = os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")])
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run([*command, *options, "--quiet"], env=environment, check=False, **streams)
 
 
 def check_pages(root: Path, html: Path) -> int:
@@ -103,7 +105,7 @@ def publish(html: Path, target: Path, digest: str) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; errors are one line on stderr and exit status 2."""
     parser = argparse.ArgumentParser(description="Execute the chapters that changed and build the HTML book.")
-    parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
+    add_profile(parser)
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
     parser.add_argument(

@@ -189,7 +189,7 @@ def check(folder: Path, only: str = "") -> dict[str, list[str]]:
 def _in_a_browser(jobs: list[tuple[str, Check, str]]) -> dict[str, list[str]]:
     """Run each job on a fresh page of one browser and return the problems of each."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
         waiting = tqdm(jobs, desc="pages", disable=not sys.stderr.isatty())
         found = {name: _with_new_page(browser, do, address) for name, do, address in waiting}
         browser.close()
@@ -204,7 +204,12 @@ def _with_new_page(browser: Browser, do: Check, address: str) -> list[str]:
         page.close()
 
 
-def _chromium() -> str:
+def chromium() -> str:
+    """Return the path of the system's Chromium.
+
+    Raises:
+        ValueError: there is none.
+    """
     found = which("chromium") or which("chromium-browser") or which("google-chrome")
     if not found:
         raise ValueError("no Chromium on this machine: apt-get install chromium")

@@ -4,6 +4,7 @@ Jupyter Book's execution cache ignores changes of the library. Here a chapter is
 which covers notebook, library, requirements.lock and profile. papermill executes it with the profile as parameter.
 """
 
+import argparse
 import hashlib
 import os
 import re
@@ -25,6 +26,7 @@ import yaml
 from papermill.exceptions import PapermillExecutionError
 
 import status
+from fedvla_lib.config import PROFILES
 
 PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
@@ -78,6 +80,21 @@ def toc_pages(root: Path) -> list[str]:
     """Return the pages of the table of contents, in order and without suffix."""
     toc = yaml.safe_load((root / "_toc.yml").read_text(encoding="utf-8"))
     return [toc["root"], *_files_under({key: value for key, value in toc.items() if key != "root"})]
+
+
+def notebooks_of(root: Path) -> list[Path]:
+    """Return the notebooks of the chapters, in the order of the table of contents."""
+    return [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file()]
+
+
+def executed_folder(root: Path, profile: str) -> Path:
+    """Return the folder of the chapters' executed copies."""
+    return root / "_build" / profile / "executed"
+
+
+def add_profile(parser: argparse.ArgumentParser) -> None:
+    """Add the option of the profile that chapters are executed with."""
+    parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(PROFILES))
 
 
 def _files_under(node: object) -> list[str]:
@@ -175,8 +192,8 @@ def execute_chapters(
         prepare: called with the profile if any chapter has to be executed, before the first.
         jobs: number of chapters executed in parallel; each then takes longer than alone.
     """
-    library, folder = library_key(root, profile), root / "_build" / profile / "executed"
-    notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file() and only in page]
+    library, folder = library_key(root, profile), executed_folder(root, profile)
+    notebooks = [path for path in notebooks_of(root) if only in path.stem]
     if not notebooks:
         raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
     chapters = {path: reuse(path, folder, library) for path in notebooks}

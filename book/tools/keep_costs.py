@@ -14,9 +14,8 @@ from pathlib import Path
 
 import nbformat
 
-from execution import toc_pages
+from execution import add_profile, executed_folder, notebooks_of
 from fedvla_book.chapter_cost import MEASURED
-from fedvla_lib.config import PROFILES
 from fedvla_lib.files import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,14 +49,12 @@ def keep(root: Path, profile: str) -> Path:
     Raises:
         ValueError: a chapter was not executed; nothing is written.
     """
-    folder = root / "_build" / profile / "executed"
-    files = [folder / f"{Path(page).name}.ipynb" for page in toc_pages(root) if page.startswith("notebooks/")]
+    files = [executed_folder(root, profile) / path.name for path in notebooks_of(root)]
     if missing := [file.stem for file in files if not file.is_file()]:
         raise ValueError(f"not executed at profile {profile}: {', '.join(missing)}; run make book first")
     date = time.strftime("%Y-%m-%d", time.gmtime(max(file.stat().st_mtime for file in files)))
     chapters = {file.stem: measured_in(file) for file in files}
     target = root / "book" / "reference" / "costs" / f"{profile}.json"
-    target.parent.mkdir(parents=True, exist_ok=True)
     write_json(target, {"cores": os.cpu_count(), "date": date, "chapters": chapters})
     return target
 
@@ -65,7 +62,7 @@ def keep(root: Path, profile: str) -> Path:
 def main() -> int:
     """Store the costs and print the path."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--profile", choices=list(PROFILES), default=os.environ.get("FEDVLA_PROFILE", "laptop"))
+    add_profile(parser)
     try:
         target = keep(ROOT, parser.parse_args().profile)
     except ValueError as error:

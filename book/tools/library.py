@@ -121,12 +121,11 @@ def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
     return "\n".join(parts)
 
 
-def table(root: Path, used: dict[str, list[str]]) -> str:
+def table(trees: dict[str, ast.Module], described: dict[str, str], used: dict[str, list[str]]) -> str:
     """Return a section for each package: its paragraph, and its modules in a table, with the first chapter to use each.
 
     Nested packages stand with the one that they are in.
     """
-    trees, described = modules(root), rooms(root)
     parts = []
     for room in [ROOT_FILES, *(name for name in described if "." not in name)]:
         words = described.get(room, ROOT_SAYS).replace("\n\n", "\n")

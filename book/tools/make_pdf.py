@@ -7,18 +7,26 @@ take another gigabyte.
 """
 
 import argparse
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-from check_site import FLAGS, _chromium
-from execution import CELL_TIMEOUT_S, BookError, Chapter, library_key, reuse, toc_pages
+from build_book import ROOT, jupyter_book
+from check_site import FLAGS, chromium
+from execution import (
+    BookError,
+    Chapter,
+    add_profile,
+    executed_folder,
+    library_key,
+    notebooks_of,
+    reuse,
+    toc_pages,
+)
+from fedvla_lib.files import new_file
 from pages import lay_out
 
-ROOT = Path(__file__).resolve().parents[2]
 TARGET = "_build/fedvla-book.pdf"
 LOAD_S = 600  # seconds for a page with all figures and videos of the book
 MARGIN = {"top": "18mm", "bottom": "18mm", "left": "16mm", "right": "16mm"}
@@ -48,9 +56,8 @@ def executed_chapters(root: Path, profile: str) -> list[Chapter]:
     Raises:
         BookError: one is missing or outdated; the message names it.
     """
-    library, folder = library_key(root, profile), root / "_build" / profile / "executed"
-    notebooks = [path for page in toc_pages(root) if (path := root / f"{page}.ipynb").is_file()]
-    chapters = {path.stem: reuse(path, folder, library) for path in notebooks}
+    library, folder = library_key(root, profile), executed_folder(root, profile)
+    chapters = {path.stem: reuse(path, folder, library) for path in notebooks_of(root)}
     if stale := [name for name, chapter in chapters.items() if chapter is None]:
         raise BookError(f"not executed at profile {profile}, or changed since: {', '.join(stale)}; run make book")
     return list(chapters.values())
@@ -58,15 +65,7 @@ def executed_chapters(root: Path, profile: str) -> list[Chapter]:
 
 def render_single(source: Path, output: Path) -> Path:
     """Render the book's source as a single page and return it; warnings are errors in `make book` only."""
-    command = [str(Path(sys.executable).with_name("jupyter-book")), "build", str(source), "--path-output", str(output)]
-    # For site_scripts.py and the documented packages.
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(ROOT), str(ROOT / "book")]),
-    }
-    done = subprocess.run(
-        [*command, "--builder", "singlehtml", "--quiet"], env=environment, capture_output=True, text=True, check=False
-    )
+    done = jupyter_book(source, output, "--builder", "singlehtml", capture_output=True, text=True)
     page = output / "_build" / "singlehtml" / f"{toc_pages(source)[0]}.html"
     if done.returncode or not page.is_file():
         raise BookError(f"jupyter-book made no single page: {' '.join(done.stderr.split())[-800:]}")
@@ -76,19 +75,17 @@ def render_single(source: Path, output: Path) -> Path:
 
 def print_page(page: Path, target: Path) -> Path:
     """Print an HTML file with Chromium and return the PDF."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = target.with_name(target.name + ".unfinished")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=_chromium(), args=FLAGS)
+    with new_file(target) as draft, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
         shown = browser.new_page()
         shown.set_default_timeout(1000 * LOAD_S)
         shown.goto(page.resolve().as_uri(), wait_until="networkidle")
         shown.add_style_tag(content=STYLE)
         shown.evaluate(PREPARE)
         paper = {"format": "A4", "margin": MARGIN, "scale": SCALE}
-        shown.pdf(path=unfinished, print_background=True, outline=True, tagged=True, **paper)
+        shown.pdf(path=draft, print_background=True, outline=True, tagged=True, **paper)
         browser.close()
-    return unfinished.replace(target)
+    return target
 
 
 def make(root: Path, profile: str) -> Path:
@@ -101,7 +98,7 @@ def make(root: Path, profile: str) -> Path:
 def main() -> int:
     """Make the PDF and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--profile", default=os.environ.get("FEDVLA_PROFILE", "laptop"), choices=list(CELL_TIMEOUT_S))
+    add_profile(parser)
     try:
         target = make(ROOT, parser.parse_args().profile)
     except (ValueError, OSError) as error:

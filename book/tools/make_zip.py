@@ -13,6 +13,8 @@ import tomllib
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
+from fedvla_lib.files import new_file
+
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "_build/fedvla-book.zip"
 # Same layout as the checkout: chapters read ../book/reference.
@@ -58,15 +60,14 @@ def build_wheel(root: Path, folder: Path) -> Path:
 
 def make(root: Path, target: Path) -> Path:
     """Write the zip and return it; its contents are in one folder of the same name."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = target.with_name(target.name + ".unfinished")
-    with tempfile.TemporaryDirectory(prefix="fedvla-zip-") as folder, ZipFile(unfinished, "w", ZIP_DEFLATED) as book:
+    temporary = tempfile.TemporaryDirectory(prefix="fedvla-zip-")
+    with temporary as folder, new_file(target) as draft, ZipFile(draft, "w", ZIP_DEFLATED) as book:
         wheel = build_wheel(root, Path(folder))
         book.write(wheel, f"{target.stem}/{wheel.name}")
         for path in _packed(root):
             book.write(path, f"{target.stem}/{path.relative_to(root).as_posix()}")
         book.writestr(f"{target.stem}/README.txt", _readme(root, wheel.name))
-    return unfinished.replace(target)
+    return target
 
 
 def _packed(root: Path) -> list[Path]:

@@ -1,7 +1,6 @@
 """Write the sources of the book's pages: the pages as they are, executed chapters, and generated parts."""
 
 import json
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import yaml
 import library
 import status
 from execution import Chapter, digest
+from fedvla_lib.files import write_atomically
 from front_page import COMPARISON, OUTCOME, VIDEO_CHAPTER, compared, headline, outcome, video
 
 PAGE_SUFFIXES = (".md", ".bib", ".png", ".svg", ".jpg", ".css", ".js", ".mp4", ".vtt")
@@ -63,7 +63,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         if Path(page) in wanted:
             wanted[Path(page)] += _benchmark_tables([root / BENCHMARKS / f"{name}.json" for name in names]).encode()
     for path, content in wanted.items():
-        _write_if_changed(source / path, content)
+        if not (source / path).is_file() or (source / path).read_bytes() != content:
+            write_atomically(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
         path.unlink()
     parts = [path.as_posix().encode() + b"\0" + content for path, content in sorted(wanted.items())]
@@ -81,9 +82,9 @@ def _library_pages(root: Path, wanted: dict[Path, bytes], chapters: Iterable[Pat
     """Fill the pages about the library and return the figure of its imports."""
     if Path(ARCHITECTURE) not in wanted:
         return {}
-    trees, used = library.modules(root), library.used_in(chapters)
-    _put(wanted, ARCHITECTURE, MODULES, lambda: library.table(root, used))
-    _put(wanted, FUNCTIONS_PAGE, FUNCTIONS, lambda: library.reference(trees, library.rooms(root)))
+    trees, described = library.modules(root), library.rooms(root)
+    _put(wanted, ARCHITECTURE, MODULES, lambda: library.table(trees, described, library.used_in(chapters)))
+    _put(wanted, FUNCTIONS_PAGE, FUNCTIONS, lambda: library.reference(trees, described))
     return {Path(IMPORTS): library.picture(library.imports(trees)).encode()}
 
 
@@ -94,15 +95,6 @@ def _rendering_config(root: Path) -> bytes:
     if config.get("repository", {}).get("url"):
         config["html"] |= dict.fromkeys(("use_edit_page_button", "use_repository_button", "use_issues_button"), True)
     return yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode()
-
-
-def _write_if_changed(path: Path, content: bytes) -> None:
-    if path.is_file() and path.read_bytes() == content:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".unfinished")
-    unfinished.write_bytes(content)
-    os.replace(unfinished, path)
 
 
 def _card_tables(account: dict) -> str:
