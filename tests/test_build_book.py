@@ -1,5 +1,7 @@
 """The book's builder executes a chapter exactly when something it depends on changed, and lets no failure through."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -38,7 +40,8 @@ def project(tmp_path) -> Path:
         "format: jb-book\nroot: book/index\nparts:\n  - caption: All\n    chapters:\n      - file: notebooks/one\n"
     )
     (tmp_path / "_config.yml").write_text("title: A book\nexecute: {execute_notebooks: force}\n")
-    (tmp_path / "book").mkdir()
+    (tmp_path / "book" / "fedvla_book").mkdir(parents=True)
+    (tmp_path / "book" / "fedvla_book" / "plots.py").write_text("WIDTH = 7\n")
     (tmp_path / "book" / "index.md").write_text("# Front\n")
     (tmp_path / "book" / "run_times.md").write_text("# Run times\n\n<!-- status -->\n")
     (tmp_path / "book" / "reference").mkdir()
@@ -50,13 +53,12 @@ def project(tmp_path) -> Path:
 @pytest.mark.unit
 def test_key_changes_with_everything_a_chapter_depends_on(project):
     keys = {execution.library_key(project, profile) for profile in ("tiny", "laptop")}
-    for path, text in (("fedvla_lib/robot/spec.py", "FPS = 20\n"), ("requirements.lock", "numpy==2.2.5\n")):
-        (project / path).parent.mkdir(exist_ok=True)
-        (project / path).write_text(text)
+    for path in ("fedvla_lib/spec.py", "book/fedvla_book/plots.py", "requirements.lock"):
+        (project / path).write_text((project / path).read_text() + "# changed\n")
         keys.add(execution.library_key(project, "tiny"))
     (project / "fedvla_lib" / "new.py").write_text("")
     keys.add(execution.library_key(project, "tiny"))
-    assert len(keys) == 5
+    assert len(keys) == 6
     notebook = project / "notebooks" / "one.ipynb"
     before = execution.notebook_key(notebook, "library")
     assert execution.notebook_key(write_notebook(notebook, code="1 + 1"), "library") != before
@@ -179,6 +181,37 @@ def test_lay_out_touches_only_what_changed(project):
     assert changed == {"index.md"} and not (source / "old.md").exists()
 
 
+def showing(html: str, path: Path) -> Path:
+    """Write an executed notebook with one cell, which shows `html`."""
+    output = nbformat.v4.new_output("display_data", {"text/html": html})
+    cells = [nbformat.v4.new_code_cell("show", outputs=[output])] if html else []
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
+    return path
+
+
+@pytest.mark.unit
+def test_every_generated_part_of_the_real_pages_is_filled_in(tmp_path):
+    """From the chapters as they are in git, without outputs, but for the one whose video the front page shows."""
+    executed = {path.stem: path for path in execution.notebooks_of(ROOT)}
+    executed[pages.VIDEO_CHAPTER] = showing(figure(1, "worked"), tmp_path / f"{pages.VIDEO_CHAPTER}.ipynb")
+    chapters = [Chapter(name, path, "key", 1.0, reused=True) for name, path in executed.items()]
+    source = tmp_path / "source"
+    pages.lay_out(ROOT, source, chapters, "tiny")
+    texts = {path.name: path.read_text() for path in (source / "book").rglob("*.md")}
+    assert "run_times.md" in texts and not [name for name, text in texts.items() if "<!--" in text]
+    assert (source / pages.OUTCOME).read_bytes().startswith(b"\x89PNG")
+    assert (source / pages.IMPORTS).read_text().startswith("<svg")
+    assert "\n## Pretraining\n" in texts["nano_base.md"] and "\n## Local training\n" in texts["speed.md"]
+
+
+@pytest.mark.unit
+def test_the_builder_loads_nothing_that_trains():
+    """Whether a chapter changed is known at once."""
+    code = "import sys, build_book; sys.exit(' '.join({'torch', 'lerobot', 'flwr'} & set(sys.modules)) or 0)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "book/tools", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def write_pages(html: Path, one: str) -> None:
     for name, text in (("book/index", "<p>front</p>"), ("notebooks/one", one)):
         (html / name).parent.mkdir(parents=True, exist_ok=True)
@@ -232,14 +265,10 @@ def figure(number: int, ending: str) -> str:
 @pytest.mark.unit
 def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
     html = "".join([figure(0, "no"), figure(10, "failed"), figure(0, "no"), figure(10, "worked")])
-    output = nbformat.v4.new_output("display_data", {"text/html": f"<div>{html}</div>"})
-    cell = nbformat.v4.new_code_cell("show", outputs=[output])
-    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "videos.ipynb")
-    said = front_page.video(tmp_path / "videos.ipynb", "tiny")
+    said = front_page.video(showing(f"<div>{html}</div>", tmp_path / "videos.ipynb"), "tiny")
     assert said.startswith(figure(10, "failed") + "\n\n") and "profile `tiny`" in said
-    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "videos.ipynb")
     with pytest.raises(BookError, match="videos.ipynb shows no video"):
-        front_page.video(tmp_path / "videos.ipynb", "tiny")
+        front_page.video(showing("", tmp_path / "videos.ipynb"), "tiny")
     assert pages.VIDEO in (ROOT / pages.FRONT_PAGE).read_bytes()
 
 

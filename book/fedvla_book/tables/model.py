@@ -1,12 +1,12 @@
 """Tables of the model: parameters of its parts, and the error of averaging LoRA adapters."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from lerobot.policies.smolvla import SmolVLAPolicy
 
-from fedvla_lib.policy.lora import A, B
+if TYPE_CHECKING:  # loads torch, which tables of stored results do without
+    from lerobot.policies.smolvla import SmolVLAPolicy
 
 MODULES = {
     "model.vlm_with_expert.vlm.model.vision_model": "vision encoder",
@@ -21,7 +21,7 @@ MODULES = {
 }
 
 
-def module_table(policy: SmolVLAPolicy) -> list[dict[str, Any]]:
+def module_table(policy: "SmolVLAPolicy") -> list[dict[str, Any]]:
     """Return one row per part of the model: module, its plain name, parameters and trainable parameters."""
     rows = []
     for prefix, part in MODULES.items():
@@ -41,6 +41,8 @@ def averaging_error(updates: Sequence[Mapping[str, np.ndarray]], weights: Sequen
     Returns:
         ||sum_k p_k B_k A_k - (sum_k p_k B_k)(sum_k p_k A_k)|| / ||sum_k p_k B_k A_k||, Frobenius norms, by name.
     """
+    from fedvla_lib.policy.lora import A, B  # loads torch
+
     errors = {}
     for name in [key.removesuffix(B) for key in updates[0] if key.endswith(B)]:
         pairs = [(update[name + B].astype(float), update[name + A].astype(float)) for update in updates]

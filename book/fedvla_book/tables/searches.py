@@ -8,7 +8,6 @@ import pandas as pd
 
 from fedvla_lib.config import STRATEGIES
 from fedvla_lib.evaluation.statistics import wilson
-from fedvla_lib.federation.strategies.build import SERVER_LR
 
 SEARCHED = ("lr", "local_steps", "fraction_train", "server_lr", "proximal_mu")
 COMPARED = (
@@ -49,6 +48,8 @@ def compared(searches: dict[str, dict[str, Any]]) -> pd.DataFrame:
 
 def _started_from(found: dict[str, Any]) -> dict[str, Any]:
     """The initial value of each searched setting; a server_lr of 0 means the strategy's default."""
+    from fedvla_lib.federation.strategies.build import SERVER_LR  # loads torch and flwr
+
     given = {name: found["config"][name] for name in found["winner"]}
     if "server_lr" in given:
         given["server_lr"] = given["server_lr"] or SERVER_LR[found["config"]["strategy"]]
