@@ -47,6 +47,11 @@ def test_there_is_a_cell_for_each_kind():
     assert {cell.kind for cell in PLAN.cells} == set(KINDS)
 
 
+def test_the_stored_cells_are_those_of_the_plan():
+    stored = {folder.name for folder in (REFERENCE / "replay").iterdir() if folder.is_dir()}
+    assert stored == {cell.name for cell in PLAN.cells}
+
+
 @pytest.mark.parametrize("cell", PLAN.cells, ids=lambda cell: cell.method)
 def test_a_stored_cell_comes_out_the_same(grid, cell):
     stored, again = events(REFERENCE / "replay" / cell.name), events(grid / cell.name)

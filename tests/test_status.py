@@ -52,4 +52,5 @@ def test_stored_experiments_are_dated():
     stamps = [json.loads(file.read_text()) for file in (ROOT / "book/reference/comparison").glob("*/stamp.json")]
     row = next(line for line in text.splitlines() if line.startswith("| `comparison` |"))
     assert f"| {len(stamps)} |" in row and max(stamp["started"] for stamp in stamps)[:10] in row
+    assert "`replay`" not in text, "cells for a test are no result"
     assert "earlier |" not in row, "a stored run of other code has a note"

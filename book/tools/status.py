@@ -13,6 +13,7 @@ from fedvla_lib import provenance, run_folder
 from fedvla_lib.config import from_profile
 
 REPORTS = "_build/tests"  # written by make test
+REPLAYED = "replay.toml"  # tiny cells for a test, no result
 UNKNOWN = "–"
 
 
@@ -99,7 +100,7 @@ def _reference(folder: Path) -> str:
 
     notes = tomllib.loads((folder / "notes.toml").read_text(encoding="utf-8"))["code"]
     today, rows = methods.trained_by(), []
-    for plan in sorted(folder.glob("*.toml")):
+    for plan in sorted(set(folder.glob("*.toml")) - {folder / REPLAYED}):
         stamps = [run_folder.read_stamp(file.parent) for file in sorted(folder.glob(f"{plan.stem}/*/stamp.json"))]
         if not stamps:
             continue
