@@ -55,13 +55,12 @@ from fedvla_book.plots.training import (
     module_bars,
     trainable_bars,
 )
-from fedvla_lib.evaluation.figures import PALETTE, WIDTH, by_round, run_differences, trends
+from fedvla_lib.evaluation.figures import PALETTE, by_round
 
 __all__ = [
     "CLIENT_COLORS",
     "METHOD_COLORS",
     "PALETTE",
-    "WIDTH",
     "architecture",
     "by_round",
     "checkpoints",
@@ -100,13 +99,11 @@ __all__ = [
     "paired_differences",
     "power",
     "rollout_grid",
-    "run_differences",
     "success_bars",
     "success_by_bytes",
     "success_intervals",
     "success_per_megabyte",
     "trainable_bars",
     "trajectories",
-    "trends",
     "use_style",
 ]

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from fedvla_book.plots.style import DASHES, client_color, method_color
+from fedvla_book.plots.style import DASHES, client_color, method_color, to_ends
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
@@ -29,9 +29,8 @@ def grouped_bars(table: pd.DataFrame, *, xlabel: str, ylabel: str, ax: Axes | No
 def loss_against_success(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw success rate against held-out loss, a point per method; columns method, loss, success_rate, low, high."""
     ax = ax or new_axes()
-    for i, point in enumerate(table.itertuples()):
+    for i, (point, error) in enumerate(zip(table.itertuples(), to_ends(table).T[:, :, None], strict=True)):
         color = method_color(point.method, i)
-        error = np.abs([[point.success_rate - point.low], [point.high - point.success_rate]])
         ax.errorbar(point.loss, point.success_rate, yerr=error, fmt="o", capsize=3, color=color, label=point.method)
     ax.set_xscale("log")  # the base's loss may be many times that of trained models
     ax.set_xlim(table.loss.min() / 1.4, 1.4 * table.loss.max())
@@ -50,8 +49,8 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, max(3.6, 1.2 + 0.4 * len(table))), layout="constrained")
     places = np.arange(len(table))
-    errors = np.abs(np.stack([table.difference - table.low, table.high - table.difference]))
-    ax.errorbar(100 * table.difference, places, xerr=100 * errors, fmt="o", capsize=4, color=PALETTE[0])
+    errors = 100 * to_ends(table, "difference")
+    ax.errorbar(100 * table.difference, places, xerr=errors, fmt="o", capsize=4, color=PALETTE[0])
     ax.axvline(0, color="#555555", linewidth=1)
     reach = max(20, 105 * table[["low", "high"]].abs().to_numpy().max())
     ax.set_xlim(-reach, reach)
@@ -78,7 +77,7 @@ def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None
     for ax, other in zip(axes, others, strict=True):
         part = table[table.other == other]
         rows = [partitions.index(name) for name in part.partition]
-        errors = 100 * np.abs(np.stack([part.difference - part.low, part.high - part.difference]))
+        errors = 100 * to_ends(part, "difference")
         ax.errorbar(100 * part.difference, rows, xerr=errors, fmt="o", capsize=4, color=method_color(other))
         ax.axvline(0, color="#555555", linewidth=1)
         ax.set_title(f"{table.method.iloc[0]}\n− {other}", fontsize=10)

@@ -8,6 +8,8 @@ anything else takes the palette in order.
 from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH
@@ -53,6 +55,11 @@ def method_color(method: str, other: int = 0) -> str:
 def client_color(client: int) -> str:
     """Return the colour of a client throughout the book, by its number; colours repeat after ten."""
     return CLIENT_COLORS[client % len(CLIENT_COLORS)]
+
+
+def to_ends(table: pd.DataFrame, value: str = "success_rate") -> np.ndarray:
+    """Return the distances, (2, rows), from a column to the columns low and high, as matplotlib draws intervals."""
+    return np.abs(np.stack([table[value] - table.low, table.high - table[value]]))
 
 
 def legend_above(axes: Sequence[Axes]) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from fedvla_book.plots.style import method_color
+from fedvla_book.plots.style import method_color, to_ends
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
@@ -16,11 +16,9 @@ def success_bars(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     width = 0.8 / len(methods)
     for i, method in enumerate(methods):
         part = table[table.method == method].set_index("task").loc[tasks]
-        errors = np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
         place = np.arange(len(tasks)) + (i - (len(methods) - 1) / 2) * width
-        ax.bar(
-            place, part.success_rate, width * 0.9, yerr=errors, capsize=3, label=method, color=method_color(method, i)
-        )
+        style = {"yerr": to_ends(part), "capsize": 3, "label": method, "color": method_color(method, i)}
+        ax.bar(place, part.success_rate, width * 0.9, **style)
     ax.set_xticks(range(len(tasks)), tasks)
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("task")
@@ -88,7 +86,7 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
     for i, partition in enumerate(partitions):
         part = table[table.partition == partition]
         rows = np.array([methods.index(method) for method in part.method]) + 0.6 * ((i + 0.5) / len(partitions) - 0.5)
-        errors = 100 * np.abs(np.stack([part.success_rate - part.low, part.high - part.success_rate]))
+        errors = 100 * to_ends(part)
         if len(partitions) == 1:  # colours then tell methods apart
             for row, rate, error, method in zip(rows, 100 * part.success_rate, errors.T, part.method, strict=True):
                 color = method_color(method, int(row))
@@ -117,10 +115,10 @@ def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     alike = table.groupby(table.MB.round()).cumcount()
     middle = (table.groupby(table.MB.round()).MB.transform("size") - 1) / 2
     places = table.MB * 1.08 ** (alike - middle)
-    for i, (place, row) in enumerate(zip(places, table.itertuples(), strict=True)):
-        errors = 100 * np.abs([[row.success_rate - row.low], [row.high - row.success_rate]])
+    errors = 100 * to_ends(table).T[:, :, None]
+    for i, (place, row, error) in enumerate(zip(places, table.itertuples(), errors, strict=True)):
         color, marker = method_color(row.method, i), "osD^vP*X"[(i + i // 8) % 8]
-        ax.errorbar(place, 100 * row.success_rate, yerr=errors, fmt=marker, capsize=3, color=color, label=row.method)
+        ax.errorbar(place, 100 * row.success_rate, yerr=error, fmt=marker, capsize=3, color=color, label=row.method)
     ax.set_xscale("log")
     ax.set_ylim(-2, 102)
     ax.set_xlabel("exchanged in total [MB, log scale], equal values shifted apart")
@@ -136,10 +134,9 @@ def success_per_megabyte(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(WIDTH, 1.0 + 0.3 * len(table)), layout="constrained")
-    points = {name: 100 * table[name] / table.MB for name in ("success_rate", "low", "high")}
-    errors = np.stack([points["success_rate"] - points["low"], points["high"] - points["success_rate"]])
+    points = table[["success_rate", "low", "high"]].mul(100 / table.MB, axis=0)
     places = np.arange(len(table))
-    ax.barh(places, points["success_rate"], xerr=np.abs(errors), capsize=3, color=PALETTE[0])
+    ax.barh(places, points.success_rate, xerr=to_ends(points), capsize=3, color=PALETTE[0])
     ax.set_yticks(places, table.method)
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("success rate per MB exchanged [points per MB], 95 % interval")

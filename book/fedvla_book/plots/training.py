@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fedvla_book.plots.style import STYLE
+from fedvla_book.plots.style import STYLE, to_ends
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 from fedvla_lib.robot.spec import FPS, JOINT_NAMES, JOINT_UNITS
 
@@ -97,7 +97,7 @@ def error_by_joint(errors: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     units = dict(zip(JOINT_NAMES, JOINT_UNITS, strict=True))
     ax.set_xticks(range(len(errors)), [f"{j.removesuffix('.pos')}\n[{units[j]}]" for j in errors.index], fontsize=8)
     ax.set_xlabel("joint")
-    ax.set_ylabel("mean absolute action error")
+    ax.set_ylabel("mean absolute action error [unit of the joint]")
     ax.legend(frameon=False)
     return ax
 
@@ -110,8 +110,7 @@ def loss_and_success(table: pd.DataFrame, x: str, *, xlabel: str, axes: Sequence
     axes[0].set_ylabel("held-out loss\n[normalised units²]")
     axes[0].set_ylim(0, 1.1 * table.loss.max())
     seen = table.dropna(subset=["success_rate"])
-    errors = np.abs(np.stack([seen.success_rate - seen.low, seen.high - seen.success_rate]))
-    axes[1].errorbar(seen[x], seen.success_rate, yerr=errors, fmt="o-", capsize=3, color=PALETTE[0])
+    axes[1].errorbar(seen[x], seen.success_rate, yerr=to_ends(seen), fmt="o-", capsize=3, color=PALETTE[0])
     axes[1].set_ylim(-0.02, 1.02)
     axes[1].set_ylabel("success rate\n(95 % Wilson interval)")
     axes[1].set_xlabel(xlabel)

@@ -6,14 +6,10 @@ One module per subject; chapters import all functions from this package.
 from fedvla_book.tables.checkpoints import clear_pairs, correlations, disagreements
 from fedvla_book.tables.clients import heterogeneity
 from fedvla_book.tables.grids import (
-    OF_RUN,
-    OTHER,
-    OWN,
     at_own_task,
     beside_own_tasks,
     by_steps,
     crossed_bootstrap,
-    difference_over_seeds,
     differences,
     fill_in,
     paired,
@@ -27,12 +23,8 @@ from fedvla_book.tables.searches import SEARCHED, compared, read_searches
 
 __all__ = [
     "crossed_bootstrap",
-    "difference_over_seeds",
     "paired",
     "paired_difference",
-    "OF_RUN",
-    "OTHER",
-    "OWN",
     "SEARCHED",
     "at_own_task",
     "averaging_error",

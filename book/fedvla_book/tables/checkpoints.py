@@ -17,7 +17,7 @@ def correlations(rounds: pd.DataFrame, by: Sequence[str] = OF_RUN) -> pd.DataFra
     if loss and success rank checkpoints alike, NaN if all are equal or there is only one.
 
     Args:
-        rounds: of `results.read_rounds`; rounds without rollouts are ignored.
+        rounds: of `grids.read_rounds`; rounds without rollouts are ignored.
         by: grouping columns, from partition, method and run.
     """
     measured = rounds.dropna(subset=["loss", "success_rate"])
@@ -42,7 +42,7 @@ def clear_pairs(rounds: pd.DataFrame) -> pd.DataFrame:
     lower success rate; same_run; same_episodes: same partition and training seed, hence same held-out episodes.
 
     Args:
-        rounds: of `results.read_rounds`; rounds without rollouts are ignored.
+        rounds: of `grids.read_rounds`; rounds without rollouts are ignored.
     """
     table = rounds.dropna(subset=["loss", "success_rate"]).sort_values("loss", kind="stable", ignore_index=True)
     ends = [statistics.wilson(int(k), int(n)) for k, n in zip(table.successes, table.n, strict=True)]
