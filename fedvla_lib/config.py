@@ -98,7 +98,7 @@ def from_profile(name: str | None = None, **overrides: Any) -> Config:
     name = name or os.environ.get("FEDVLA_PROFILE", "laptop")
     if name not in PROFILES:
         raise ValueError(f"unknown profile {name!r}: choose one of {', '.join(PROFILES)}")
-    return check(replace(Config(), **{**PROFILES[name], **_require_known(overrides)}))
+    return from_run_config(PROFILES[name] | _require_known(overrides))
 
 
 def from_run_config(run_config: dict[str, Any]) -> Config:

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
-
 
 def cache_dir() -> Path:
     """Return the folder of cached recordings, frames, meshes and models: ``$FEDVLA_CACHE`` or ``~/.cache/fedvla``."""
@@ -51,6 +49,8 @@ def new_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
     Raises:
         OSError: also for write errors of safetensors, which has its own exception; the message names `folder`.
     """
+    from safetensors import SafetensorError  # here, since the doctor imports this module where packages may be missing
+
     folder.parent.mkdir(parents=True, exist_ok=True)
     hidden = {"dir": folder.parent, "prefix": f".{folder.name}.", "ignore_cleanup_errors": True}
     with tempfile.TemporaryDirectory(**hidden) as scratch:

@@ -26,7 +26,7 @@ from typing import Any
 import pandas as pd
 from filelock import FileLock, Timeout
 
-from fedvla_lib.config import Config, check
+from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.files import as_json, write_atomically, write_json
 from fedvla_lib.provenance import config_hash, first_stamp, now
 
@@ -149,7 +149,7 @@ def resumable(root: Path, config: Config) -> dict[str, Any]:
 
 def read_config(root: Path) -> Config:
     """Return the settings of a run."""
-    return check(Config(**json.loads((Path(root) / "config.json").read_text())))
+    return from_run_config(json.loads((Path(root) / "config.json").read_text()))
 
 
 def read_stamp(root: Path) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from fedvla_lib.cli.commands import settings
 from fedvla_lib.cli.main import main
 from fedvla_lib.cli.parser import build_parser
 from fedvla_lib.config import Config, from_profile, from_run_config
-from fedvla_lib.experiments.results import P_VALUES
+from fedvla_lib.evaluation.statistics import P_VALUES
+from fedvla_lib.files import write_json
 
 COMMANDS = ["doctor", "record", "pretrain", "experts", "config", "train", "run", "evaluate"]
 
@@ -70,6 +71,9 @@ def test_every_setting_is_a_flag_and_unset_flags_leave_the_profile_alone():
         (["evaluate", "{tmp}"], "{tmp} is not a pretrained_model folder: it has no config.json"),
         (["evaluate", "{tmp}", "--rollouts", "0"], "--rollouts 0 is not usable"),
         (["train", "--resume", "{tmp}/none"], "{tmp}/none"),
+        (["train", "--resume", "{tmp}", "--lr", "1e-4"], "--lr cannot be given with --resume"),
+        (["train", "--steps", "-5", "--out", "{tmp}/out"], "--steps -5 is not usable: give 1 or more"),
+        (["compare", "{tmp}", "{tmp}/b", "--metrics", ""], "unknown metric ''"),
         (["train", "--profile", "tiny", "--client", "9", "--out", "{tmp}/out"], "partition-id=9"),
     ],
 )
@@ -153,6 +157,7 @@ def _undo_last_step(root: Path) -> None:
         for path in sorted(folder.rglob("*"), reverse=True):
             path.rmdir() if path.is_dir() else path.unlink()
         folder.rmdir()
+    write_json(root / "stamp.json", {**run_folder.read_stamp(root), "status": "interrupted"})
 
 
 @pytest.mark.integration

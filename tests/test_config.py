@@ -52,6 +52,8 @@ def test_overrides_win():
         (lambda: from_profile("tiny", learning_rate=1), "unknown setting 'learning_rate'"),
         (lambda: from_run_config({"num-rounds": 1}), "unknown setting 'num_rounds'"),
         (lambda: from_run_config({"lr": "fast"}), "lr='fast' has type str"),
+        (lambda: from_profile("tiny", lr="fast"), "lr='fast' has type str"),
+        (lambda: from_profile("tiny", augment="no"), "augment='no' has type str: give bool"),
         (lambda: from_run_config({"num-clients": True}), "give int"),
         (lambda: from_run_config({"num-clients": 2.5}), "give int"),
     ],

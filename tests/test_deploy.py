@@ -100,7 +100,7 @@ def refusal(node_of: deployment.Deployment) -> str:
     """Start a SuperNode of the deployment, which must reject the server at once, and return its log."""
     with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
         node_of.start_node(0)
-    processes.stop(node_of.nodes[0])
+    processes.stop(node_of.nodes[0].pid)
     return node_of.log(0).read_text()
 
 
@@ -259,6 +259,9 @@ def test_authentication_needs_encryption_and_data_a_folder_for_each_client(tmp_p
         pass
     with pytest.raises(ValueError, match="1 data folders for num-clients=2"):
         with deployment.running_deployment(tmp_path, 2, data=[tmp_path]):
+            pass
+    with pytest.raises(ValueError, match=f"no data set at {tmp_path}/b: give the folder"):
+        with deployment.running_deployment(tmp_path, 2, data=[tmp_path, tmp_path / "b"]):
             pass
     assert not list(tmp_path.iterdir())
 

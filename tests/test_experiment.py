@@ -87,6 +87,9 @@ def test_cells_come_seed_by_seed_and_only_those_wanted(file):
         (("rollouts = 2", "rollouts = 'two'"), "rollouts='two'.*above 0"),
         (('method = "averaged"', 'strategy = "averaged"'), "'strategy' under.*method"),
         (("[methods.pooled]", "[methods.'../pooled']"), "'../pooled'"),
+        ((GRID[GRID.index("[[only]]") :], "[only]\nseed = 0"), "only={'seed': 0}.*tables"),
+        (('profile = "tiny"', "profile = [1]"), r"profile=\[1\].*a name"),
+        (("num_clients = 2", "num_clients = 2.5"), "num-clients=2.5 has type float: give int"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_with_the_remedy(file, change, message, capsys):

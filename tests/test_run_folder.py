@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,9 @@ def test_settings_and_stamp_read_back(tmp_path):
     began = time.time()
     root = make(config)
     assert run_folder.read_config(root) == config
+    files.write_json(tmp_path / "other/config.json", {**asdict(config), "temperature": 1.0})
+    with pytest.raises(ValueError, match="unknown setting 'temperature'"):
+        run_folder.read_config(tmp_path / "other")  # of another version
     stamp = run_folder.read_stamp(root)
     assert stamp["status"] == "completed"
     assert 0 <= stamp["wall_s"] <= time.time() - began + 1

@@ -85,16 +85,11 @@ def config(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train one policy, on all data or on one client's, into a run folder."""
-    from fedvla_lib.files import write_json
-    from fedvla_lib.run_folder import RunFolder, hold, read_config, read_stamp, start
+    from fedvla_lib.run_folder import start
 
-    if options.resume:
-        root, config = options.resume, read_config(options.resume)
-        with hold(root):
-            _train_into(RunFolder(root), config, options)
-            write_json(root / "stamp.json", {**read_stamp(root), "status": "completed", "resumed": True})
-        return
-    chosen = settings(options)
+    if options.steps is not None:
+        _require_positive("--steps", options.steps)
+    chosen = _new_or_resumed(options)
     with start(chosen, engine="local") as folder:
         _train_into(folder, chosen, options)
 
@@ -102,14 +97,14 @@ def train(options: argparse.Namespace) -> None:
 def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> None:
     from fedvla_lib.evaluation.measure import log_measurement, measure
     from fedvla_lib.evaluation.rollouts import rollout_seeds
-    from fedvla_lib.experiments.methods import train_alone
+    from fedvla_lib.experiments.methods import steps_in_a_row, train_alone
     from fedvla_lib.federation.client import open_client, open_pooled
     from fedvla_lib.policy.model import load_policy, save_policy
     from fedvla_lib.policy.training import Checkpoints
 
     learner = open_pooled(chosen) if options.client is None else open_client(chosen, options.client)
     bundle = load_policy(chosen, learner.statistics())
-    steps = options.steps or chosen.num_server_rounds * chosen.local_steps
+    steps = options.steps or steps_in_a_row(chosen)
     checkpoints = Checkpoints(folder.root / "checkpoints", resume=options.resume is not None)
     result = train_alone(bundle, learner, steps=steps, checkpoints=checkpoints)
     save_policy(bundle, folder.root / "model")
@@ -132,10 +127,10 @@ def run(options: argparse.Namespace) -> None:
         from fedvla_lib.engines.inline import run_inline as run_federation
     else:
         from fedvla_lib.engines.simulation import run_simulation as run_federation
-    _print_rounds(run_federation(_federated_settings(options)))
+    _print_rounds(run_federation(_new_or_resumed(options)))
 
 
-def _federated_settings(options: argparse.Namespace) -> Config:
+def _new_or_resumed(options: argparse.Namespace) -> Config:
     """Return the settings of a new run, or of the interrupted run to resume.
 
     Raises:
@@ -160,7 +155,7 @@ def deploy(options: argparse.Namespace) -> None:
     """Run a federation in processes on this machine and print the measurements of the global model by round."""
     from fedvla_lib.engines.deployment import run_deployed
 
-    chosen, data = _federated_settings(options), options.node_data or []
+    chosen, data = _new_or_resumed(options), options.node_data or []
     _print_rounds(run_deployed(chosen, tls=options.tls, auth=options.auth, data=data))
 
 
@@ -322,8 +317,7 @@ def _require_positive(flag: str, value: int) -> None:
 
 
 def _print_table(table: Any) -> None:
-    from fedvla_lib.evaluation.statistics import p_text
-    from fedvla_lib.experiments.results import P_VALUES
+    from fedvla_lib.evaluation.statistics import P_VALUES, p_text
 
     formats = dict.fromkeys(P_VALUES, p_text)
     print(table.to_string(index=False, float_format="{:.3f}".format, formatters=formats))

@@ -33,7 +33,7 @@ APT_RENDERING = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 
 # Renders a red box in the middle of the frame; prints the mean colour of the centre and of a corner.
 DRAW_A_FRAME = """
-import fedvla_lib.robot.scene  # selects the driver as the chapters do, before MuJoCo is imported
+import fedvla_lib  # selects the driver as the chapters do, before MuJoCo is imported
 import mujoco
 model = mujoco.MjModel.from_xml_string('''
 <mujoco><worldbody><light pos="0 0 3"/><geom type="box" size=".2 .2 .2" rgba="1 0 0 1"/>

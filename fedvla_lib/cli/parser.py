@@ -87,7 +87,7 @@ def _add_experts(subparsers: Any) -> None:
 
 
 def _add_train(subparsers: Any) -> None:
-    kept = "checkpoints are in the run folder; fedvla train --resume FOLDER continues"
+    kept = "checkpoints are in the run folder; fedvla train --resume FOLDER, --client and --steps as before, continues"
     text = "train a policy without federation: on all data, or on one client's partition"
     parser = _command(subparsers, commands.train, text, kept)
     parser.add_argument("--client", type=int, metavar="K", help="train on client K's partition only")

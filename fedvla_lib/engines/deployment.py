@@ -75,7 +75,7 @@ class Deployment:
 
     def kill_node(self, partition_id: int) -> None:
         """Kill a SuperNode and its child processes without warning, as a power cut would."""
-        processes.stop(self.nodes.pop(partition_id), (signal.SIGKILL,))
+        processes.stop(self.nodes.pop(partition_id).pid, (signal.SIGKILL,))
 
     def _command(self, partition_id: int) -> list[str]:
         node_config = f"partition-id={partition_id} num-partitions={self.num_clients}"
@@ -108,20 +108,23 @@ def running_deployment(
         raise ValueError("auth=True needs tls=True: Flower authenticates nodes on encrypted connections only")
     if data and len(data) != num_clients:
         raise ValueError(f"{len(data)} data folders for num-clients={num_clients}: give one for each client, or none")
+    if missing := [str(path) for path in data if not Path(path).is_dir()]:
+        raise ValueError(f"no data set at {missing[0]}: give the folder of each node's data set")
     files = credentials.make_server(folder / "server") if tls else None
     keys = [credentials.make_node_key(folder / "keys", f"node_{k}") for k in range(num_clients)] if auth else []
     options = ["--enable-supernode-auth"] if auth else []
-    with superlink.local_superlink(folder, *options, files=files) as link:
-        deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients)
-        try:
+    nodes: dict[int, subprocess.Popen] = {}
+    try:
+        with superlink.local_superlink(folder, *options, files=files) as link:
             for key in keys:
                 link.ask("supernode", "register", str(key.public), CONNECTION)
+            deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients, nodes)
             for k in range(num_clients):
                 deployment.start_node(k)
             yield deployment
-        finally:
-            for node in deployment.nodes.values():
-                processes.stop(node)
+    finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
+        for node in nodes.values():  # killed, since it would try for long to take leave of the SuperLink
+            processes.stop(node.pid, (signal.SIGKILL,))
 
 
 def run_deployed(

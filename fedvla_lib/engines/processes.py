@@ -8,7 +8,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+
+import psutil
 
 STARTUP_S = 120.0  # a two-core machine needs 10 to 40 s just after a boot
 FIRST_ERROR = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*(\S.*)$", re.MULTILINE)
@@ -40,16 +43,24 @@ def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, 
         time.sleep(0.5)
 
 
-def stop(process: subprocess.Popen, signals: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
-    """Send each signal in turn to a program and its child processes until the program has ended."""
+def stop(pid: int, signals: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
+    """Send each signal in turn to a program and its process group until it has ended, then kill its descendants.
+
+    Flower starts helpers in sessions of their own, and its server app outlives a SIGTERM when its SuperLink is gone.
+    """
+    try:
+        leader = psutil.Process(pid)
+        descendants = leader.children(recursive=True)
+    except psutil.NoSuchProcess:
+        return
     for number in signals:
-        try:
-            os.killpg(process.pid, number)
-            process.wait(timeout=15)
-        except ProcessLookupError:
-            return
-        except subprocess.TimeoutExpired:
-            continue
+        with suppress(ProcessLookupError, psutil.TimeoutExpired):
+            os.killpg(pid, number)
+            leader.wait(timeout=15)
+            break
+    for descendant in descendants:
+        with suppress(psutil.NoSuchProcess):
+            descendant.kill()
 
 
 def program(name: str) -> str:
@@ -75,9 +86,9 @@ def reason(log: Path) -> str:
     """Return the first exception in a log, which caused any later ones, and the end of the log."""
     text = log.read_text(errors="replace")
     first = FIRST_ERROR.search(text)
-    cause = f"it began with {_one_line(first[1])}; " if first else ""
-    return f"{cause}its log ends: {_one_line(text)}"
+    cause = f"it began with {one_line(first[1])}; " if first else ""
+    return f"{cause}its log ends: {one_line(text)}"
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     return " ".join(text.split())[-800:]

@@ -15,22 +15,19 @@ RUNTIME_TRIES = 3
 NOT_STARTED = "Simulation Runtime crashed"  # logged by Flower if Ray did not start, before any client was called
 
 
-def run_simulation(
-    config: Config, *, cpus_per_client: int = 1, gpus_per_client: float = 0.0, timeout_s: float = 24 * 3600.0
-) -> Path:
+def run_simulation(config: Config, *, timeout_s: float = 24 * 3600.0) -> Path:
     """Run a federation on Flower's simulation runtime (Ray workers) and return its run folder.
 
     Raises:
         FlowerRunError: the run failed or timed out.
         ValueError: unusable settings.
     """
-    config = check(replace(absolute(config), num_threads=config.num_threads or cpus_per_client))
+    config = check(replace(absolute(config), num_threads=config.num_threads or 1))
     before = run_folders(config)
-    resources = f"client-resources-num-cpus={cpus_per_client} client-resources-num-gpus={gpus_per_client}"
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
         app, settings = app_bundle.stage_app(Path(folder)), app_bundle.write_settings(Path(folder), config)
         with local_superlink(Path(folder), "--simulation") as link:
-            federation = f"num-supernodes={config.num_clients} {resources}"
+            federation = f"num-supernodes={config.num_clients} client-resources-num-cpus=1"
             options = ["--federation-config", federation, "--run-config", str(settings)]
             require_completed(link, _submit(link, app, options, timeout_s))
     return own_run(config, before)

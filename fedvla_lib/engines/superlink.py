@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fedvla_lib.engines.credentials import ServerFiles
-from fedvla_lib.engines.processes import FlowerRunError, _one_line, free_port, program, reason, start, stop, wait_until
+from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, program, reason, start, stop, wait_until
 
 STATUS_TRIES, POLL_S = 6, 5.0
 COMPLETED = "finished:completed"
@@ -73,10 +73,10 @@ class SuperLink:
         arguments = [program("flwr"), *command, "--format", "json"]
         done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
-            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(done.stderr or done.stdout)}")
+            raise FlowerRunError(f"flwr {command[0]} failed: {one_line(done.stderr or done.stdout)}")
         answer = json.loads(done.stdout[done.stdout.find("{\n") :])
         if not answer.get("success", True):
-            raise FlowerRunError(f"flwr {command[0]} failed: {_one_line(answer.get('error-message', done.stdout))}")
+            raise FlowerRunError(f"flwr {command[0]} failed: {one_line(answer.get('error-message', done.stdout))}")
         return answer
 
 
@@ -106,7 +106,7 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
         wait_until(lambda: answers(port, files), process, log, "the SuperLink")
         yield SuperLink(environment, home / "run.log", port, files)
     finally:
-        stop(process)
+        stop(process.pid)
 
 
 def flower_environment(home: Path) -> dict[str, str]:
@@ -153,7 +153,7 @@ def answers(port: int, files: ServerFiles | None = None) -> bool:
     try:
         with urllib.request.urlopen(f"{scheme}://127.0.0.1:{port}/health", timeout=2, context=trust) as response:
             return response.status == 200
-    except (urllib.error.URLError, OSError):
+    except OSError:
         return False
 
 

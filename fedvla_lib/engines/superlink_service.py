@@ -41,7 +41,7 @@ def up(home: Path) -> str:
         processes.wait_until(lambda: superlink.answers(port), process, log, "the SuperLink")
         write_json(home / "superlink.json", {"pid": process.pid, "created": psutil.Process(process.pid).create_time()})
     except BaseException:  # Ctrl-C does not reach the new session of the process
-        processes.stop(process)
+        processes.stop(process.pid)
         raise
     return f"{_address()} is up, process {process.pid}; its log is {log}"
 
@@ -73,11 +73,7 @@ def down(home: Path) -> str:
     """Stop the SuperLink and its child processes, and return a status message."""
     if not (process := _running(home)):
         return f"{_address()} is not up"
-    processes_to_stop = [*process.children(recursive=True), process]
-    process.terminate()
-    _, alive = psutil.wait_procs(processes_to_stop, timeout=15)
-    for survivor in alive:
-        survivor.kill()
+    processes.stop(process.pid)
     (home / "superlink.json").unlink()
     return f"{_address()} is down"
 

@@ -13,6 +13,7 @@ from statsmodels.stats.proportion import proportion_confint
 
 CONFIDENCE = 0.95
 POWER = 0.8
+P_VALUES = ["p_value", "mcnemar_p", "p_holm"]  # columns of tables
 SMALLEST_P = 0.001  # smaller p-values are printed as "< 0.001"
 DISTINCT = 8  # distinct values that the bootstrap of a mean needs
 

@@ -15,7 +15,7 @@ from fedvla_lib.data import recordings
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import success_rate
 from fedvla_lib.experiments import methods
-from fedvla_lib.experiments.experiment_file import Cell, Plan
+from fedvla_lib.experiments.experiment_file import KINDS, Cell, Plan
 from fedvla_lib.federation.nodes import client_name
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.run_folder import GLOBAL, RunFolder
@@ -149,10 +149,7 @@ def _clients(config: Config, seeds: Sequence[int]) -> Measured:
     )  # fmt: skip
 
 
-MEASURES = {
-    "base": _base, "federated": _federated, "centralized": _centralized, "local-only": _local_only,
-    "clients": _clients,
-}  # fmt: skip
+MEASURES = dict(zip(KINDS, (_base, _federated, _centralized, _local_only, _clients), strict=True))
 
 
 def with_recording(config: Config) -> Config:

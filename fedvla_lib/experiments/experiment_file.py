@@ -95,10 +95,13 @@ def _check_types(content: dict[str, Any], file: Path) -> None:
     for name in ("methods", "partitions"):
         tables = content[name]
         checks[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
+    only = content.get("only", [])
+    checks["only"] = (isinstance(only, list) and all(isinstance(rule, dict) for rule in only), "tables [[only]]")
+    checks["profile"] = (isinstance(content.get("profile", ""), str), "a name")
     for name, (fits, wanted) in checks.items():
         if not fits:
             raise ValueError(f"{file}: {name}={content[name]!r} is not usable: give {wanted}")
-    for rule in content.get("only", []):
+    for rule in only:
         if unknown := sorted(set(rule) - set(RULES)):
             raise ValueError(f"{file}: unknown name {unknown[0]!r} under [[only]]: choose from {', '.join(RULES)}")
 

@@ -69,8 +69,7 @@ def base(config: Config) -> model.Bundle:
 
 def centralized(config: Config, progress: bool = True) -> model.Bundle:
     """Train on all clients' training episodes for `total_steps`, or load the cached model."""
-    pooled = open_pooled(config)
-    return _cached(config, CENTRALIZED, lambda: _train(config, pooled, total_steps(config), progress))
+    return _cached(config, CENTRALIZED, lambda: _train(config, open_pooled(config), total_steps(config), progress))
 
 
 def local_only(config: Config, partition_id: int, progress: bool = True) -> model.Bundle:
@@ -78,8 +77,8 @@ def local_only(config: Config, partition_id: int, progress: bool = True) -> mode
 
     Normalisation uses the pooled statistics, as in the federation.
     """
-    client, steps = open_client(config, partition_id), steps_per_client(config)
-    return _cached(config, _local_name(partition_id), lambda: _train(config, client, steps, progress))
+    name, steps = _local_name(partition_id), steps_per_client(config)
+    return _cached(config, name, lambda: _train(config, open_client(config, partition_id), steps, progress))
 
 
 def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Read an experiment's run folders into tables: rollouts, rounds, a summary of methods, paired differences."""
+"""Read the run folders of an experiment into tables: a row per rollout, and a summary of each method."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,7 +17,6 @@ RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "va
 PARALLEL = ("federated", "clients")  # kinds whose clients train in parallel
 LOCAL_ONLY = "local-only"
 HELD_OUT = ("loss", "action_error")
-P_VALUES = ["p_value", "mcnemar_p", "p_holm"]
 
 
 def read_results(folder: Path) -> pd.DataFrame:
@@ -35,7 +34,8 @@ def read_results(folder: Path) -> pd.DataFrame:
 
 def cell_folders(folder: Path) -> Iterator[Path]:
     """Yield the run folders of an experiment's cells, or raise ValueError if there is none."""
-    cells = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
+    found = sorted(stamp.parent for stamp in Path(folder).glob("[!.]*/stamp.json"))
+    cells = [run for run in found if "method" in run_folder.read_stamp(run)]  # other runs may be there too
     if not cells:
         raise ValueError(f"no results in {folder}: make some with fedvla experiment")
     yield from cells

@@ -100,7 +100,7 @@ def federate(
         timeout=config.round_timeout_s,
         train_config=ConfigRecord({messages.STATS: packed}),
         evaluate_config=ConfigRecord({messages.STATS: packed}),
-        evaluate_fn=RoundEnd(evaluator, strategy, run, states, done),
+        evaluate_fn=RoundEnd(evaluator, strategy, states),
     )
 
 
@@ -110,19 +110,17 @@ class RoundEnd:
 
     evaluator: "GlobalEvaluator"
     strategy: Checked
-    run: RunFolder
     states: ClientStates | None
-    done: int  # rounds that an earlier process completed
 
     def __call__(self, flower_round: int, record: ArrayRecord) -> MetricRecord | None:
         """End a round, unless an earlier process already did."""
-        if self.done and flower_round == 0:
+        if self.strategy.rounds_done and flower_round == 0:
             return None
-        number = self.done + flower_round
+        number = self.strategy.rounds_done + flower_round
         measured = self.evaluator(number, record)
         strategy = checkpoint.flat(self.strategy.state())
         clients = checkpoint.flat(self.states.client_states() if self.states else {})
-        checkpoint.save(self.run.root, Checkpoint(number, messages.unpack_arrays(record), strategy, clients))
+        checkpoint.save(self.evaluator.run.root, Checkpoint(number, messages.unpack_arrays(record), strategy, clients))
         return measured
 
 

@@ -50,7 +50,7 @@ class TrainResult:
 
     losses: list[float]  # flow-matching loss of each gradient step, in order
     num_examples: int  # training frames of the client: its weight in federated averaging
-    steps: int  # gradient steps as counted, including those before a resume
+    steps: int  # of the optimiser, counted as it took them, and those before a resume
     seconds: float  # wall time of this call
     moments: Arrays = field(default_factory=dict)  # optimiser state by name; empty unless `Start.moments` was given
 
@@ -104,9 +104,11 @@ def local_train(
     with _seeded(batches.seed, start.step):
         optimizer, scheduler = _optimizer(bundle, config, start.step, start.total_steps or start.step + steps)
         _load_moments(bundle, optimizer, start.moments or {})
-        losses = _restore(bundle, optimizer, scheduler, checkpoints)
+        losses, taken = _restore(bundle, optimizer, scheduler, checkpoints), []
+        optimizer.register_step_post_hook(lambda *_: taken.append(1))  # counts what the optimiser did
         bundle.policy.train()
-        bar = tqdm(range(len(losses), steps), initial=len(losses), total=steps, desc="training", disable=not progress)
+        done = len(losses)
+        bar = tqdm(range(done, steps), initial=done, total=steps, desc="training", disable=not progress)
         for step in bar:
             value = loss(bundle, batches.at(start.step + step))
             losses.append(_step(bundle, value, optimizer, scheduler, objective.correction))
@@ -117,7 +119,7 @@ def local_train(
                 _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoints.folder))
         bundle.policy.eval()
         after = {} if start.moments is None else _moments(bundle, optimizer)
-    return TrainResult(losses, batches.num_examples, len(losses), time.perf_counter() - began, after)
+    return TrainResult(losses, batches.num_examples, done + len(taken), time.perf_counter() - began, after)
 
 
 def _step(

@@ -181,5 +181,5 @@ def read_account(base: Path | None = None) -> dict[str, Any]:
     """
     path = (base or nano.nano_base()) / CARD_FILE
     if not path.is_file():
-        raise ValueError(f"{base} has no {CARD_FILE}: it was not made by fedvla pretrain")
+        raise ValueError(f"{path.parent} has no {CARD_FILE}: it was not made by fedvla pretrain")
     return json.loads(path.read_text())

@@ -10,8 +10,8 @@ from statsmodels.stats.proportion import confint_proportions_2indep
 
 from fedvla_lib import run_folder
 from fedvla_lib.evaluation import statistics
-from fedvla_lib.evaluation.statistics import CONFIDENCE
-from fedvla_lib.experiments.results import HELD_OUT, LOCAL_ONLY, P_VALUES, cell_columns, cell_folders
+from fedvla_lib.evaluation.statistics import CONFIDENCE, P_VALUES
+from fedvla_lib.experiments.results import HELD_OUT, LOCAL_ONLY, cell_columns, cell_folders
 
 OF_RUN = ("partition", "method", "run")
 PARTITION_FREE = ("base", "centralized")  # kinds that do not depend on the partition of a recording
