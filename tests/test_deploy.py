@@ -100,7 +100,7 @@ def refusal(node_of: deployment.Deployment) -> str:
     """Start a SuperNode of the deployment, which must reject the server at once, and return its log."""
     with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
         node_of.start_node(0)
-    processes.stop(node_of.nodes[0].pid)
+    processes.stop(node_of.nodes[0])
     return node_of.log(0).read_text()
 
 

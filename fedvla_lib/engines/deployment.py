@@ -75,7 +75,7 @@ class Deployment:
 
     def kill_node(self, partition_id: int) -> None:
         """Kill a SuperNode and its child processes without warning, as a power cut would."""
-        processes.stop(self.nodes.pop(partition_id).pid, (signal.SIGKILL,))
+        processes.stop(self.nodes.pop(partition_id), (signal.SIGKILL,))
 
     def _command(self, partition_id: int) -> list[str]:
         node_config = f"partition-id={partition_id} num-partitions={self.num_clients}"
@@ -124,7 +124,7 @@ def running_deployment(
             yield deployment
     finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
         for node in nodes.values():  # killed, since it would try for long to take leave of the SuperLink
-            processes.stop(node.pid, (signal.SIGKILL,))
+            processes.stop(node, (signal.SIGKILL,))
 
 
 def run_deployed(

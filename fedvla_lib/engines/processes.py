@@ -43,19 +43,22 @@ def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, 
         time.sleep(0.5)
 
 
-def stop(pid: int, signals: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
+def stop(
+    process: subprocess.Popen | psutil.Process,
+    signals: Sequence[signal.Signals] = (signal.SIGTERM, signal.SIGKILL),
+) -> None:
     """Send each signal in turn to a program and its process group until it has ended, then kill its descendants.
 
     Flower starts helpers in sessions of their own, and its server app outlives a SIGTERM when its SuperLink is gone.
     """
     try:
-        leader = psutil.Process(pid)
+        leader = psutil.Process(process.pid)
         descendants = leader.children(recursive=True)
     except psutil.NoSuchProcess:
         return
     for number in signals:
         with suppress(ProcessLookupError, psutil.TimeoutExpired):
-            os.killpg(pid, number)
+            os.killpg(process.pid, number)
             leader.wait(timeout=15)
             break
     for descendant in descendants:

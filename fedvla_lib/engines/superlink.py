@@ -106,7 +106,7 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
         wait_until(lambda: answers(port, files), process, log, "the SuperLink")
         yield SuperLink(environment, home / "run.log", port, files)
     finally:
-        stop(process.pid)
+        stop(process)
 
 
 def flower_environment(home: Path) -> dict[str, str]:

@@ -41,7 +41,7 @@ def up(home: Path) -> str:
         processes.wait_until(lambda: superlink.answers(port), process, log, "the SuperLink")
         write_json(home / "superlink.json", {"pid": process.pid, "created": psutil.Process(process.pid).create_time()})
     except BaseException:  # Ctrl-C does not reach the new session of the process
-        processes.stop(process.pid)
+        processes.stop(process)
         raise
     return f"{_address()} is up, process {process.pid}; its log is {log}"
 
@@ -73,7 +73,7 @@ def down(home: Path) -> str:
     """Stop the SuperLink and its child processes, and return a status message."""
     if not (process := _running(home)):
         return f"{_address()} is not up"
-    processes.stop(process.pid)
+    processes.stop(process)
     (home / "superlink.json").unlink()
     return f"{_address()} is down"
 
