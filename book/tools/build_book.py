@@ -17,9 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from execution import BookError, add_profile, execute_chapters, record_data, toc_pages
+from fedvla_lib.files import write_atomically
 from pages import lay_out
 
 ROOT = Path(__file__).resolve().parents[2]
+# Jupyter Book's own page at the root names no icon, so browsers ask for a favicon.ico, which does not exist. An icon
+# in a file would be loaded while the browser already goes on to the next page.
+FRONT_DOOR = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>Federated robot learning you can run</title>
+<link rel="icon" href="data:,"><meta http-equiv="refresh" content="0; url=book/index.html"></head>
+<body><a href="book/index.html">The front page</a></body></html>
+"""
 BUILT_FROM = ".built-from"  # file next to the pages with the digest of their sources
 
 
@@ -29,7 +37,9 @@ def render(source: Path, output: Path) -> Path:
     built = jupyter_book(source, output, "-W", "-n", "--keep-going", stdout=subprocess.DEVNULL)
     if built.returncode:
         raise BookError("jupyter-book reported the warnings above, which are errors")
-    return output / "_build" / "html"
+    html = output / "_build" / "html"
+    write_atomically(html / "index.html", FRONT_DOOR.encode())
+    return html
 
 
 def jupyter_book(source: Path, output: Path, *options: str, **streams: Any) -> subprocess.CompletedProcess:
