@@ -3,6 +3,7 @@
 import re
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import nbformat
 import pandas as pd
@@ -52,11 +53,12 @@ def headline(rows: pd.DataFrame) -> str:
     of_task = rows[rows.partition == "task"]
     of_method = results.summary(of_task).set_index("method")
     labs, tasks = of_task.client.nunique(), of_task.task.nunique()
+    at_own = tables.beside_own_tasks(of_task, LOCAL_LONGER, FEDERATED, seed=0)
     return "\n".join([
         f"**Result.** Each of {labs} labs holds demonstrations of one of {tasks} tasks. "
         "Brackets are 95 % intervals, each on its own; {doc}`/notebooks/06_federated_vs_centralized` explains them.\n",
         *(f"- {said}" for said in (_at_equal_total(of_method), _cadences(of_method), _gaps(rows),
-                                   _local_share(of_task), _local_longer(of_task, labs), _open(rows))),
+                                   _local_share(of_task), _local_longer(of_task, at_own, labs), _open(rows, at_own))),
         "", _outcome_figure(of_method),
     ])  # fmt: skip
 
@@ -109,11 +111,10 @@ def _local_share(of_task: pd.DataFrame) -> str:
     )
 
 
-def _local_longer(of_task: pd.DataFrame, labs: int) -> str:
+def _local_longer(of_task: pd.DataFrame, found: dict[str, Any], labs: int) -> str:
     """Labs alone with as many steps as the federation, at their own task, next to the federated model."""
     longer = of_task[of_task.method == LOCAL_LONGER]
     steps, elsewhere = longer.steps_in_all.mean(), longer[~tables.at_own_task(longer)]
-    found = tables.beside_own_tasks(of_task, LOCAL_LONGER, FEDERATED, seed=0)
     rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
     gap = _points(*(-100 * found[end] for end in ("difference", "high", "low")), " points")
     seeds = "one training seed" if found["seeds"] == 1 else f"{found['seeds']} training seeds"
@@ -126,10 +127,8 @@ def _local_longer(of_task: pd.DataFrame, labs: int) -> str:
     )
 
 
-def _open(rows: pd.DataFrame) -> str:
+def _open(rows: pd.DataFrame, found: dict[str, Any]) -> str:
     """What this grid leaves open, and why."""
-    of_task = rows[rows.partition == "task"]
-    found = tables.beside_own_tasks(of_task, LOCAL_LONGER, FEDERATED, seed=0)
     missing = [words for name, words in DEALT.items()
                if not (rows[rows.partition == name].method == FEDERATED).any()]  # fmt: skip
     solved = found["success_rate"] > NEARLY_SOLVED
