@@ -258,6 +258,22 @@ def test_warnings_of_the_book_are_errors(project, capfd):
     assert "nowhere" in capfd.readouterr().err
 
 
+@pytest.mark.integration
+def test_a_changed_stylesheet_alone_reaches_the_pages_and_the_root_leads_to_the_front_page(project):
+    with (project / "_config.yml").open("a") as config:
+        config.write("sphinx: {config: {html_static_path: [book/_static]}}\n")
+    (project / "book" / "run_times.md").unlink()  # no page of the contents
+    style, source, output = project / build_book.STATIC / "book.css", project / "source", project / "output"
+    style.parent.mkdir()
+    for rule in ("p {color: red}", "p {color: blue}"):
+        style.write_text(rule)
+        pages.lay_out(project, source, [Chapter("one", project / "notebooks" / "one.ipynb", "", 1.0, True)], "tiny")
+        html = build_book.render(source, output)
+        assert (html / "_static" / "book.css").read_text() == rule
+    front_door = (html / "index.html").read_text()
+    assert "url=book/index.html" in front_door and 'rel="icon" href="data:,"' in front_door
+
+
 def figure(number: int, ending: str) -> str:
     return f'<figure><video aria-label="Round {number}. Lift the red cube. {ending}"></video></figure>'
 

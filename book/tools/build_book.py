@@ -28,6 +28,7 @@ FRONT_DOOR = """<!doctype html>
 <link rel="icon" href="data:,"><meta http-equiv="refresh" content="0; url=book/index.html"></head>
 <body><a href="book/index.html">The front page</a></body></html>
 """
+STATIC = "book/_static"  # html_static_path in _config.yml
 BUILT_FROM = ".built-from"  # file next to the pages with the digest of their sources
 
 
@@ -38,6 +39,8 @@ def render(source: Path, output: Path) -> Path:
     if built.returncode:
         raise BookError("jupyter-book reported the warnings above, which are errors")
     html = output / "_build" / "html"
+    if (static := source / STATIC).is_dir():  # Sphinx copies it only when a page changed
+        shutil.copytree(static, html / static.name, dirs_exist_ok=True)
     write_atomically(html / "index.html", FRONT_DOOR.encode())
     return html
 

@@ -34,8 +34,9 @@ def video(chapter: Path, profile: str) -> str:
     if not by_round:
         raise BookError(f"{chapter.name} shows no video of a round, which the front page needs")
     return (
-        f"{max(by_round, key=by_round.get)}\n\nThe federated policy in this build, profile `{profile}`: overhead "
-        "camera left, front camera right. {doc}`/notebooks/05_evaluation_videos` shows the others, failures included."
+        f"{max(by_round, key=by_round.get)}\n\nThe federated policy that chapter 4 trained in this build, profile "
+        f"`{profile}` (not one of those in the result below): overhead camera left, front camera right. "
+        "{doc}`/notebooks/05_evaluation_videos` shows the others, failures included."
     )
 
 

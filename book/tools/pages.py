@@ -35,7 +35,7 @@ RESULTS_ON = {
 TITLES = {
     "fine_tuning": "fine-tuning: each task alone from the base, on one core",
     "floor": "the floor",
-    "four_methods": "base, federated, local-only with its share of the steps, and centralized",
+    "four_methods": "federated, local-only with its share of the steps, and centralized",
 }
 BENCHMARKS = "benchmarks/results"
 
