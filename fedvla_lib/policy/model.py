@@ -9,6 +9,7 @@ import contextlib
 import io
 import shutil
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,13 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
+from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, TransitionKey, create_transition
 from safetensors import safe_open
 
 from fedvla_lib.config import Config, granted_threads, personal_parts
 from fedvla_lib.data.normalisation import Stats
 from fedvla_lib.files import new_folder
+from fedvla_lib.policy import lean_expert
 from fedvla_lib.policy.lora import add_adapters, merged
 from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
@@ -40,6 +43,19 @@ class Bundle:
     preprocess: Any  # raw batch (degrees, images in [0, 1], task text) -> normalised, tokenised tensors
     postprocess: Any  # normalised actions -> degrees and gripper 0-100
     own: Arrays = field(default_factory=dict)  # personal parameters, as they were when the policy was loaded
+
+    @cached_property
+    def is_lean(self) -> bool:
+        """Whether the action expert can be trained by `lean_expert`."""
+        return not lean_expert.refusal(self.policy)
+
+    def normalise_actions(self, actions: torch.Tensor) -> torch.Tensor:
+        """Return joint targets as the policy is trained on them: (B, chunk, 6) in degrees -> normalised."""
+        transition = create_transition(action=actions)
+        for step in self.preprocess.steps:
+            if isinstance(step, DeviceProcessorStep | NormalizerProcessorStep):
+                transition = step(transition)
+        return transition[TransitionKey.ACTION]
 
     def shared(self) -> dict[str, torch.nn.Parameter]:
         """Return the trainable parameters that are not personal, by name (the live ones, not copies)."""

@@ -23,6 +23,7 @@ from transformers import DynamicCache
 from fedvla_lib.data.batches import Batches, batch_of_rows, targets_of_rows
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.files import cache_dir, new_folder
+from fedvla_lib.policy import lean_expert
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY
 
@@ -76,15 +77,17 @@ def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, time
         noise: float32 (B, chunk, max_action_dim), x_1 of the flow.
         times: float32 (B,), t in (0, 1); the expert sees x_t = t noise + (1 - t) action.
     """
-    policy = bundle.policy
-    stored, real = batch[PREFIX_KEY]
-    inputs = bundle.preprocess({key: value for key, value in batch.items() if key != PREFIX_KEY})
-    actions = policy.prepare_action(inputs)  # (B, chunk, max_action_dim) normalised
+    policy, width = bundle.policy, bundle.policy.config.action_feature.shape[0]
+    stored, real = (part.to(noise.device) for part in batch[PREFIX_KEY])
+    actions = policy.prepare_action({ACTION_KEY: bundle.normalise_actions(batch[ACTION_KEY])})  # padded like the noise
     mixed = times[:, None, None] * noise + (1 - times[:, None, None]) * actions
-    velocity = policy.model.denoise_step(real.to(noise.device), _as_cache(stored.to(noise.device)), mixed, times)
-    squared = ((noise - actions) - velocity).square()[..., : policy.config.action_feature.shape[0]]
-    valid = ~inputs["action_is_pad"]
-    return (squared * valid[..., None]).sum() / (valid.sum() * squared.shape[-1]).clamp_min(1)
+    if bundle.is_lean:
+        velocity = lean_expert.velocity(policy, stored, real, mixed, times)
+    else:
+        velocity = policy.model.denoise_step(real, _as_cache(stored), mixed, times)[..., :width]
+    squared = ((noise - actions)[..., :width] - velocity).square()
+    valid = ~batch["action_is_pad"].to(noise.device)
+    return (squared * valid[..., None]).sum() / (valid.sum() * width).clamp_min(1)
 
 
 def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:

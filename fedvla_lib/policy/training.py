@@ -104,14 +104,14 @@ def local_train(
     with _seeded(batches.seed, start.step):
         optimizer, scheduler = _optimizer(bundle, config, start.step, start.total_steps or start.step + steps)
         _load_moments(bundle, optimizer, start.moments or {})
-        losses, taken = _restore(bundle, optimizer, scheduler, checkpoints), []
+        losses, taken, parameters = _restore(bundle, optimizer, scheduler, checkpoints), [], trainable(bundle.policy)
         optimizer.register_step_post_hook(lambda *_: taken.append(1))  # counts what the optimiser did
         bundle.policy.train()
         done = len(losses)
         bar = tqdm(range(done, steps), initial=done, total=steps, desc="training", disable=not progress)
         for step in bar:
             value = loss(bundle, batches.at(start.step + step))
-            losses.append(_step(bundle, value, optimizer, scheduler, objective.correction))
+            losses.append(_step(bundle, parameters, value, optimizer, scheduler, objective.correction))
             if not np.isfinite(losses[-1]):
                 raise FloatingPointError(f"loss is {losses[-1]} at step {start.step + step}: lower lr={config.lr}")
             bar.set_postfix(loss=f"{losses[-1]:.3f}")
@@ -123,13 +123,14 @@ def local_train(
 
 
 def _step(
-    bundle: Bundle, loss: torch.Tensor, optimizer: torch.optim.Optimizer, scheduler: Any, correction: Correction | None
-) -> float:
+    bundle: Bundle, parameters: Parameters, loss: torch.Tensor, optimizer: torch.optim.Optimizer, scheduler: Any,
+    correction: Correction | None,
+) -> float:  # fmt: skip
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     if correction:
-        correction(trainable(bundle.policy))
-    torch.nn.utils.clip_grad_norm_(trainable(bundle.policy).values(), bundle.policy.config.optimizer_grad_clip_norm)
+        correction(parameters)
+    torch.nn.utils.clip_grad_norm_(parameters.values(), bundle.policy.config.optimizer_grad_clip_norm)
     optimizer.step()
     scheduler.step()
     return loss.item()
@@ -167,6 +168,8 @@ def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int
     """SmolVLA's AdamW and cosine-with-warm-up presets with the run's learning rate and length, at `start_step`."""
     settings = bundle.policy.config
     optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
+    if str(settings.device) == "cpu":  # one call for all arrays; elsewhere PyTorch's default does so
+        optimizer.param_groups[0]["fused"] = True
     floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of final to peak rate
     schedule = {"num_warmup_steps": config.warmup_steps, "num_decay_steps": total_steps}
     preset = replace(settings.get_scheduler_preset(), peak_lr=config.lr, decay_lr=floor, **schedule)
