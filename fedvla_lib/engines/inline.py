@@ -64,11 +64,11 @@ def run_inline(
 
 
 def cached(loaders: client.Loaders) -> client.Loaders:
-    """Return loaders that open the frames and build the policy once and share them between the clients of a run."""
+    """Return loaders that open and divide the frames and build the policy once, for all clients of a run."""
     # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
     build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
     frames = functools.cache(loaders.open_frames)
-    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)))
+    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)), functools.cache(loaders.shares))
 
 
 class InlineGrid(Grid):

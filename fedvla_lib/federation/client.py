@@ -30,13 +30,14 @@ CLIENT_SEEDS = 1_000  # rollout seeds reserved for each client
 
 @dataclass(frozen=True)
 class Loaders:
-    """How frames are opened and a policy is built; the inline engine passes cached functions.
+    """How frames are opened, divided among clients, and a policy is built; the inline engine passes cached functions.
 
     Clients may share one policy: each overwrites all trainable arrays, and nothing else changes.
     """
 
     open_frames: Callable[[Config], frame_store.FrameStore]
     load_policy: Callable[[Config, Stats], Bundle]  # settings, statistics to normalise with
+    shares: Callable[[frame_store.FrameStore, Config], list[Share]] = shares
 
 
 LOADERS = Loaders(open_frames, model.load_policy)
@@ -124,7 +125,7 @@ def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, o
     if own_data:
         return open_pooled(replace(config, data=own_data), loaders, partition_id)
     store = loaders.open_frames(config)
-    return Client(config, partition_id, store, shares(store, config)[partition_id])
+    return Client(config, partition_id, store, loaders.shares(store, config)[partition_id])
 
 
 def open_pooled(config: Config, loaders: Loaders = LOADERS, partition_id: int = 0) -> Client:

@@ -146,8 +146,7 @@ def make_note(**values: Any) -> ConfigRecord:
 def _decode(name: str, array: Array) -> np.ndarray:
     """Return one array of a record after checking that its bytes are a .npy of numbers of the declared size."""
     try:
-        _check_npy(name, array)
-        return array.numpy()
+        return _numbers(name, array).copy()  # of its own, writable memory
     except ParameterError:
         raise
     # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
@@ -155,19 +154,20 @@ def _decode(name: str, array: Array) -> np.ndarray:
         raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
 
 
-def _check_npy(name: str, array: Array) -> None:
-    """Compare the header with the declaration and the number of bytes before anything is allocated.
+def _numbers(name: str, array: Array) -> np.ndarray:
+    """Return a view of an array's bytes, after comparing the header with the declaration and the number of bytes.
 
-    NumPy alone would open an archive, or allocate as many numbers as the header claims.
+    `np.load` would open an archive, or allocate as many numbers as the header claims.
     """
     file = io.BytesIO(array.data)
     version = np.lib.format.read_magic(file)
     if version not in NPY_HEADERS:
         raise ValueError(f".npy version {version}, expected one of {sorted(NPY_HEADERS)}")
-    shape, _, dtype = NPY_HEADERS[version](file)
+    shape, by_column, dtype = NPY_HEADERS[version](file)
     if dtype.kind not in "biufc" or str(dtype) != array.dtype:
         raise ParameterError("dtype", f"array {name!r} holds {dtype}, expected numbers of the declared {array.dtype!r}")
     if shape != tuple(array.shape):
         raise ParameterError("shape", f"array {name!r} has shape {shape}, declared as {tuple(array.shape)}")
     if (wanted := math.prod(shape) * dtype.itemsize) != (found := len(array.data) - file.tell()):
         raise ParameterError("shape", f"array {name!r} of shape {shape} needs {wanted} bytes, has {found}")
+    return np.ndarray(shape, dtype, array.data, file.tell(), order="F" if by_column else "C")
