@@ -65,7 +65,7 @@ class Config:
     # run
     seed: int = 0  # seed of data order, initial weights, noise, client sampling and rollouts
     device: str = "cpu"  # torch device: cpu, cuda or mps; cpu becomes cuda where Flower reserves a GPU for a client
-    num_threads: int = 0  # torch threads; 0 uses all cores granted to this process
+    num_threads: int = 0  # torch threads; 0 uses one for a small policy, else all cores granted to this process
     out: str = "outputs"  # parent folder of the run folders
     resume: str = ""  # run folder of an interrupted run to resume; empty starts a new run
 
@@ -131,11 +131,6 @@ def split_names(names: str) -> list[str]:
 def granted_cores() -> int:
     """Return the number of CPU cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def granted_threads(config: Config) -> int:
-    """Return the number of torch threads to use: `config.num_threads`, or all granted cores if that is 0."""
-    return config.num_threads or granted_cores()
 
 
 def check(config: Config) -> Config:

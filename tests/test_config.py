@@ -11,7 +11,6 @@ from fedvla_lib.config import (
     Config,
     from_profile,
     from_run_config,
-    granted_threads,
     task_names,
     to_run_config,
 )
@@ -91,11 +90,6 @@ def test_run_config_keys_have_dashes_and_whole_numbers_pass_for_floats():
 
 def test_task_names_are_stripped():
     assert task_names(replace(Config(), tasks="lift , push,")) == ["lift", "push"]
-
-
-def test_threads_are_those_granted_unless_set():
-    assert granted_threads(Config()) >= 1
-    assert granted_threads(replace(Config(), num_threads=3)) == 3
 
 
 def test_cache_follows_the_environment(monkeypatch, tmp_path):

@@ -12,7 +12,7 @@ from lerobot.policies.smolvla import SmolVLAPolicy
 from safetensors.torch import load_file, save_file
 
 from fedvla_book import tables
-from fedvla_lib.config import from_profile
+from fedvla_lib.config import from_profile, granted_cores
 from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY
@@ -120,3 +120,13 @@ def test_another_kind_of_policy_is_refused(tmp_path):
     (tmp_path / "p" / "config.json").write_text(json.dumps({"type": "act", "device": saved["device"]}))
     with pytest.raises(ValueError, match="'act' policy: give a smolvla"):
         model.load_policy(replace(CONFIG, base=str(tmp_path / "p")), STATS)
+
+
+@pytest.mark.unit
+def test_a_small_policy_uses_one_thread_unless_told_and_a_large_one_all_cores(monkeypatch):
+    policy, chosen = model.load_policy(CONFIG, STATS).policy, []
+    monkeypatch.setattr(model.torch, "set_num_threads", chosen.append)
+    for threads, smallest in ((0, model.SMALL), (3, model.SMALL), (0, 1)):
+        monkeypatch.setattr(model, "SMALL", smallest)
+        model.use_threads(replace(CONFIG, num_threads=threads), policy)
+    assert chosen == [1, 3, granted_cores()]

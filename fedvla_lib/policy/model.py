@@ -22,7 +22,7 @@ from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, TransitionKey, create_transition
 from safetensors import safe_open
 
-from fedvla_lib.config import Config, granted_threads, personal_parts
+from fedvla_lib.config import Config, granted_cores, personal_parts
 from fedvla_lib.data.normalisation import Stats
 from fedvla_lib.files import new_folder
 from fedvla_lib.policy import lean_expert
@@ -32,6 +32,7 @@ from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
 
 POSITION_STD = 0.3  # standard deviation of the nano vision encoder's initial position embeddings
+SMALL = 50_000_000  # parameters below which one thread is used; the nano policy has 2.4 million, SmolVLA 450
 VLM_FOLDER = "vlm"  # a saved nano policy includes its backbone's config and tokenizer, so the folder can be moved
 
 
@@ -75,16 +76,26 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     Raises:
         ValueError: the base cannot be found or lacks weights, or there are no statistics.
     """
-    torch.set_num_threads(granted_threads(config))  # the order of sums, and so their last bits, depends on it
     if stats is None and config.base == NANO_RANDOM:
         raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
     source = str(nano_base()) if config.base == NANO else config.base
     policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
+    use_threads(config, policy)
     if config.lora_rank:
         chosen = {"freeze_a": config.lora_freeze_a, "adapt_state": config.train_state_proj, "seed": config.seed}
         add_adapters(policy, config.lora_rank, **chosen)
     policy.eval()
     return Bundle(policy, *_processors(policy, stats, source), _own(policy, personal_parts(config)))
+
+
+def use_threads(config: Config, policy: SmolVLAPolicy) -> None:
+    """Set the number of torch threads of this process; the order of sums, and so their last bits, depends on it.
+
+    At nano size a second thread makes a step hardly faster, and several times slower as soon as another process wants
+    the core: there cores are for processes side by side.
+    """
+    small = sum(parameter.numel() for parameter in policy.parameters()) < SMALL
+    torch.set_num_threads(config.num_threads or (1 if small else granted_cores()))
 
 
 def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:

@@ -19,9 +19,9 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 from safetensors.torch import load_file, save_file
 from tqdm.auto import tqdm
 
-from fedvla_lib.config import Config, granted_threads
+from fedvla_lib.config import Config
 from fedvla_lib.files import new_folder
-from fedvla_lib.policy.model import Bundle
+from fedvla_lib.policy.model import Bundle, use_threads
 from fedvla_lib.policy.parameters import Arrays, trainable
 from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
 
@@ -99,7 +99,7 @@ def local_train(
     Raises:
         FloatingPointError: the loss is not finite; checkpoints so far are kept.
     """
-    torch.set_num_threads(granted_threads(config))
+    use_threads(config, bundle.policy)
     began, loss = time.perf_counter(), objective.loss or flow_loss
     with _seeded(batches.seed, start.step):
         optimizer, scheduler = _optimizer(bundle, config, start.step, start.total_steps or start.step + steps)

@@ -1,0 +1,115 @@
+"""Independent pieces of work side by side, each in a process of its own that computes on one thread.
+
+The results are those of one process, bit for bit: a piece of work depends on its arguments only.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
+from graphlib import TopologicalSorter
+from typing import Any
+
+import psutil
+
+from fedvla_lib.config import granted_cores
+
+GIB_A_JOB = 2.0  # memory of a process that trains or evaluates at nano size
+HEAVY = ("lerobot.policies.smolvla",)  # takes seconds to import; not MuJoCo, whose display must not be shared
+TERMINATED = 143  # exit status after SIGTERM, as shells report it
+
+
+def default_jobs() -> int:
+    """Return ``$FEDVLA_JOBS``, or else one job for each core, as many as free memory allows."""
+    chosen = os.environ.get("FEDVLA_JOBS", "")
+    if chosen and not (chosen.isdecimal() and int(chosen)):
+        raise ValueError(f"FEDVLA_JOBS={chosen!r} is not usable: give a whole number from 1")
+    return int(chosen or max(1, min(granted_cores(), int(psutil.virtual_memory().available / 2**30 / GIB_A_JOB))))
+
+
+def side_by_side(
+    function: Callable[[Any], Any], items: Sequence[Hashable], jobs: int, *, after: Mapping[Any, Iterable] | None = None,
+    preload: Sequence[str] = HEAVY,
+) -> Iterator[tuple[Any, Any]]:  # fmt: skip
+    """Yield (item, result) for each item, as they complete; with one job in this process, one after the other.
+
+    Args:
+        function: of one item; with several jobs both are pickled, so `function` stands in a module.
+        items: the earlier ones start first.
+        jobs: processes at most.
+        after: by item, other items that must be complete before it starts.
+        preload: modules that the processes share, imported once.
+
+    Raises:
+        Exception: what `function` raised, at once; pieces of work that still run are ended.
+    """
+    order = TopologicalSorter({item: set((after or {}).get(item, ())) & set(items) for item in items})
+    order.prepare()
+    jobs, ready, running = min(jobs, len(items)), [], {}
+    with processes(jobs, preload) if jobs > 1 else nullcontext() as pool:
+        while order.is_active():
+            ready = sorted([*ready, *order.get_ready()], key=items.index)
+            while ready and len(running) < max(1, jobs):
+                item = ready.pop(0)
+                running[pool.submit(function, item) if pool else _here(function, item)] = item
+            for done in wait(running, return_when=FIRST_COMPLETED).done:
+                item = running.pop(done)
+                yield item, done.result()
+                order.done(item)
+
+
+def _here(function: Callable[[Any], Any], item: Any) -> Future:
+    """Call the function in this process."""
+    done: Future = Future()
+    done.set_result(function(item))
+    return done
+
+
+@contextmanager
+def processes(jobs: int, preload: Sequence[str] = HEAVY) -> Iterator[Executor]:
+    """Yield a pool of processes with one thread each; an exception, Ctrl-C too, ends those that still work."""
+    # A fork of a process that has only imported starts at once. Not everywhere, and never a fork of this process.
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    if method == "forkserver":
+        context.set_forkserver_preload(list(preload))
+    before = set(multiprocessing.active_children())
+    with _one_thread():
+        pool = ProcessPoolExecutor(jobs, context, _begin, (os.getpid(),))
+        try:
+            yield pool
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Numerical libraries of processes started meanwhile use one thread: they read the variable when they load."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop("OMP_NUM_THREADS") if before is None else os.environ.update(OMP_NUM_THREADS=before)
+
+
+def _begin(parent: int) -> None:
+    """Prepare a worker process: it leaves Ctrl-C to its parent, cleans up when told to end, and never outlives it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while psutil.pid_exists(parent):
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)
