@@ -152,6 +152,7 @@ def _add_experiment(subparsers: Any) -> None:
     parser.add_argument("file", type=Path, help="the plan, a TOML file; see fedvla_lib/experiments/experiment_file.py")
     text = "the folder for the results, a run folder per cell"
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=text)
+    _add_jobs(parser, "cells")
 
 
 def _add_search(subparsers: Any) -> None:
@@ -190,6 +191,11 @@ def _add_videos(subparsers: Any) -> None:
 def _add_tasks(parser: argparse.ArgumentParser, default: str) -> None:
     text = f"name of a task; repeat for several (default: {default})"
     parser.add_argument("--task", action="append", metavar="NAME", help=text)
+
+
+def _add_jobs(parser: argparse.ArgumentParser, what: str) -> None:
+    text = f"{what} at a time, each in a process of its own (default: $FEDVLA_JOBS, else one per core)"
+    parser.add_argument("--jobs", type=int, metavar="N", help=text)
 
 
 def _add_metrics(parser: argparse.ArgumentParser, default: str) -> None:

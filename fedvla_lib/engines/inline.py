@@ -1,16 +1,18 @@
 """Run the Flower app in this process, for notebooks, tests and debugging.
 
-A Flower `Grid` calls the ClientApp directly, one client after the other in the order of their partitions. To scale up,
-run the same app with `simulation` or `deployment`.
+A Flower `Grid` calls the ClientApp directly, one client after the other in the order of their partitions, or several at
+a time in worker processes, with the same result. To scale up, run the same app with `simulation` or `deployment`.
 """
 
 import copy
 import functools
+import itertools
 import logging
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import Executor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from flwr.app import Context, Error, Message, RecordDict, UserConfig
@@ -26,6 +28,7 @@ from fedvla_lib.data.normalisation import pack_stats, unpack_stats
 from fedvla_lib.federation import client, client_app, server_app
 from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
 from fedvla_lib.policy.parameters import Arrays
+from fedvla_lib.workers import processes
 
 logger = logging.getLogger(__name__)
 RUN_ID = 1
@@ -39,6 +42,7 @@ def run_inline(
     data: Sequence[Path] = (),
     progress: bool = True,
     raise_errors: bool = False,
+    jobs: int = 1,
 ) -> Path:
     """Run a federation in this process and return its run folder; results are bitwise reproducible.
 
@@ -47,18 +51,22 @@ def run_inline(
         data: a data set for each client; empty: each client uses its partition of ``config.data``.
         progress: show a progress bar over the clients of each round.
         raise_errors: re-raise a client's exception (for debugging) instead of rejecting its reply.
+        jobs: clients of a round that work at a time, each in a process with this library's ClientApp.
 
     Raises:
         TooFewReplies: a round had fewer valid replies than `config.min_replies`; the run folder is kept.
         ValueError: unusable settings, data or output folder.
     """
+    if jobs > 1 and (clients_app or raise_errors):
+        raise ValueError(f"jobs={jobs}: clients_app and raise_errors need jobs=1, which runs clients in this process")
     loaders = cached(client.LOADERS)
     app = clients_app or client_app.build(loaders)
     run_config = to_run_config(check(config))
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
     claim_identity()
-    with _quiet_flower():
+    with _quiet_flower(), processes(jobs) if jobs > 1 else nullcontext() as pool:
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
+        grid.pool = pool
         server_app.build(loaders, engine="inline", progress=progress, states=grid)(grid, context)
     return Path(context.state["run"]["folder"])
 
@@ -81,6 +89,8 @@ class InlineGrid(Grid):
         data: a data set for each client; empty: all use `config.data`.
     """
 
+    pool: Executor | None = None  # worker processes that handle messages in place of `app`
+
     def __init__(
         self,
         app: ClientApp,
@@ -95,6 +105,7 @@ class InlineGrid(Grid):
         self._run = Run.create_empty(RUN_ID)
         self._replies: dict[str, Message] = {}
         self._took_s: dict[str, float] = {}
+        self._ids = itertools.count()
         self._contexts = {}
         for k in range(num_clients):
             node, node_config = FIRST_NODE_ID + k, {PARTITION: k, "num-partitions": num_clients}
@@ -125,8 +136,20 @@ class InlineGrid(Grid):
         """Handle the messages in the order of nodes and return their ids."""
         ordered = sorted(messages, key=lambda message: message.metadata.dst_node_id)
         kind = ordered[0].metadata.message_type if ordered else ""
-        bar = tqdm(ordered, desc=f"clients: {kind}", disable=not (self._progress and ordered), leave=False)
-        return [self._handle(message) for message in bar]
+        contexts = [self._contexts[message.metadata.dst_node_id] for message in ordered]
+        for message in ordered:
+            message.metadata.__dict__["_message_id"] = str(next(self._ids))  # replies refer to it, as on Flower's grids
+        if self.pool:
+            handled = self.pool.map(_in_worker, ordered, contexts)
+        else:
+            handled = (_handle(self._app, *each, self._raise_errors) for each in zip(ordered, contexts, strict=True))
+        bar = tqdm(handled, total=len(ordered), desc=f"clients: {kind}", disable=not (self._progress and ordered),
+                   leave=False)  # fmt: skip
+        for message, (reply, context, seconds) in zip(ordered, bar, strict=True):
+            key = message.metadata.message_id
+            self._replies[key], self._took_s[key] = reply, seconds
+            self._contexts[message.metadata.dst_node_id] = context
+        return [message.metadata.message_id for message in ordered]
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
         """Return the replies to the given messages, each only once."""
@@ -155,22 +178,33 @@ class InlineGrid(Grid):
             node, name = key.split(":", 1)
             self._contexts[int(node)].state[name] = pack_arrays(arrays)
 
-    def _handle(self, message: Message) -> str:
-        """Pass the client a copy, as a network would, so that its changes do not reach the server's records."""
-        key = str(len(self._took_s))
-        message.metadata.__dict__["_message_id"] = key  # replies refer to it; Flower's grids set it in the same way
-        node, began = message.metadata.dst_node_id, time.perf_counter()
-        try:
-            self._replies[key] = self._app(copy.deepcopy(message), self._contexts[node])
-        except Exception as error:
-            if self._raise_errors:
-                raise
-            logger.debug("client on node %d raised\n%s", node, traceback.format_exc())
-            reason = f"{type(error).__name__}: {error}"
-            failure = Error(code=ErrorCode.CLIENT_APP_RAISED_EXCEPTION, reason=reason)
-            self._replies[key] = Message(failure, reply_to=message)
-        self._took_s[key] = time.perf_counter() - began
-        return key
+
+def _handle(app: ClientApp, message: Message, context: Context, raise_errors: bool) -> tuple[Message, Context, float]:
+    """Return a client's reply, or the error reply for its exception, its context, and the seconds that it took.
+
+    The client gets a copy, as over a network, so that its changes do not reach the server's records.
+    """
+    began = time.perf_counter()
+    try:
+        reply = app(copy.deepcopy(message), context)
+    except Exception as error:
+        if raise_errors:
+            raise
+        logger.debug("client on node %d raised\n%s", context.node_id, traceback.format_exc())
+        failure = Error(code=ErrorCode.CLIENT_APP_RAISED_EXCEPTION, reason=f"{type(error).__name__}: {error}")
+        reply = Message(failure, reply_to=message)
+    return reply, context, time.perf_counter() - began
+
+
+@functools.cache
+def _app_of_process() -> ClientApp:
+    """The ClientApp of a worker process, which handles messages of many clients and loads frames and policy once."""
+    claim_identity()
+    return client_app.build(cached(client.LOADERS))
+
+
+def _in_worker(message: Message, context: Context) -> tuple[Message, Context, float]:
+    return _handle(_app_of_process(), message, context, raise_errors=False)
 
 
 def claim_identity() -> None:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from fedvla_lib.experiments.experiment_file import KINDS, Cell, Plan
 from fedvla_lib.federation.nodes import client_name
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.run_folder import GLOBAL, RunFolder
+from fedvla_lib.workers import side_by_side
 
 
 @dataclass(frozen=True)
@@ -35,16 +37,20 @@ class Measured:
     train_s: float = 0.0
 
 
-def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print) -> None:
-    """Measure every cell that has no run folder in `out` yet."""
+def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print, jobs: int = 1) -> None:
+    """Measure every cell that has no run folder in `out` yet, `jobs` of them at a time, each in its own process."""
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     todo = [cell for cell in plan.cells if not (out / cell.name).exists()]
     say(f"{len(plan.cells)} cells, {len(plan.cells) - len(todo)} of them in {out}")
-    for number, cell in enumerate(todo, 1):
-        began = time.perf_counter()
-        rate = measure_cell(cell, plan.rollout_seeds, out)
-        say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {time.perf_counter() - began:.0f} s")
+    measured = side_by_side(partial(_timed, seeds=plan.rollout_seeds, out=out), todo, jobs)
+    for number, (cell, (rate, seconds)) in enumerate(measured, 1):
+        say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {seconds:.0f} s")
+
+
+def _timed(cell: Cell, seeds: Sequence[int], out: Path) -> tuple[float, float]:
+    began = time.perf_counter()
+    return measure_cell(cell, seeds, out), time.perf_counter() - began
 
 
 def measure_cell(cell: Cell, seeds: Sequence[int], out: Path) -> float:
