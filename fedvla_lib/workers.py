@@ -33,9 +33,13 @@ def default_jobs() -> int:
 
 
 def side_by_side(
-    function: Callable[[Any], Any], items: Sequence[Hashable], jobs: int, *, after: Mapping[Any, Iterable] | None = None,
+    function: Callable[[Any], Any],
+    items: Sequence[Hashable],
+    jobs: int,
+    *,
+    after: Mapping[Any, Iterable] | None = None,
     preload: Sequence[str] = HEAVY,
-) -> Iterator[tuple[Any, Any]]:  # fmt: skip
+) -> Iterator[tuple[Any, Any]]:
     """Yield (item, result) for each item, as they complete; with one job in this process, one after the other.
 
     Args:
@@ -104,6 +108,7 @@ def _one_thread() -> Iterator[None]:
 
 def _begin(parent: int) -> None:
     """Prepare a worker process: it leaves Ctrl-C to its parent, cleans up when told to end, and never outlives it."""
+    os.environ["FEDVLA_JOBS"] = "1"  # commands that it runs start no processes of their own
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

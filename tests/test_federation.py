@@ -26,7 +26,7 @@ from fedvla_lib.experiments import methods
 from fedvla_lib.federation import client_app, messages
 from fedvla_lib.federation.client import LOADERS, client_seed, open_client
 from fedvla_lib.federation.nodes import TooFewReplies
-from fedvla_lib.policy import model, training
+from fedvla_lib.policy import model, prefix_cache, training
 from fedvla_lib.policy.parameters import digest, layer_of, shapes_of, trainable_arrays
 from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY
 
@@ -66,6 +66,7 @@ def test_one_client_averaging_equals_local_training_bit_for_bit(tiny, rank, tmp_
     batches = Batches(
         store, train_ids, config.chunk_size, config.batch_size, client_seed(config.seed, 0), config.augment
     )
+    batches = prefix_cache.with_cached_prefixes(bundle, batches)  # as a client does
     for start in (training.Start(0, 6), training.Start(3, 6)):
         training.local_train(bundle, batches, config, steps=3, start=start, progress=False)
     model.save_policy(bundle, tmp_path / "local")  # with adapters added in

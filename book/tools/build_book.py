@@ -16,9 +16,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-from execution import BookError, add_profile, execute_chapters, record_data, toc_pages
+from execution import (
+    BookError,
+    Chapter,
+    add_profile,
+    digest,
+    execute_chapters,
+    library_key,
+    named_bytes,
+    record_data,
+    toc_pages,
+)
 from fedvla_lib.files import write_atomically
-from pages import lay_out
+from fedvla_lib.workers import default_jobs
+from status import REPORTS
 
 ROOT = Path(__file__).resolve().parents[2]
 # Jupyter Book's own page at the root names no icon, so browsers ask for a favicon.ico, which does not exist. An icon
@@ -85,14 +96,26 @@ def build(root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1
         print(f"{len(chapters)} chapters executed at profile {profile}", flush=True)
         return None
     work, published = root / "_build" / profile, root / "_build" / "html" / profile
-    digest = lay_out(root, work / "source", chapters, profile)
-    if not is_published(published, digest):
+    made_from = sources(root, profile, chapters)
+    if not is_published(published, made_from):
+        from pages import lay_out  # loads PyTorch and Matplotlib, which an unchanged book does not need
+
+        lay_out(root, work / "source", chapters, profile)
         html = render(work / "source", work)
         check_pages(root, html)
-        publish(html, published, digest)
+        publish(html, published, made_from)
     count = check_pages(root, published)
     print(f"{count} pages, {len(chapters)} chapters, profile {profile}, {time.monotonic() - start:.0f} s")
     return published / "index.html"
+
+
+def sources(root: Path, profile: str, chapters: list[Chapter]) -> str:
+    """Return a digest of all that the pages are made from: executed chapters, pages, stored results, library, tools."""
+    folders = [root / name for name in ("book", "benchmarks/results", REPORTS)]
+    files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
+    files += [root / "_toc.yml", root / "_config.yml", *(chapter.executed for chapter in chapters)]
+    named = (named_bytes(root, path) for path in files if "__pycache__" not in path.parts)
+    return digest([library_key(root, profile).encode(), *named])
 
 
 def is_published(target: Path, digest: str) -> bool:
@@ -121,15 +144,13 @@ def main(argv: list[str] | None = None) -> int:
     add_profile(parser)
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
-    parser.add_argument(
-        "--jobs", default=1, type=int, metavar="N", help="chapters in parallel; above 1 only with profile tiny"
-    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="chapters at a time (default: one per core)")
     options = parser.parse_args(argv)
-    if options.jobs < 1 or (options.jobs > 1 and options.profile != "tiny"):
-        parser.error(f"--jobs {options.jobs}: chapters of profile {options.profile} are timed one at a time")
+    if options.jobs is not None and options.jobs < 1:
+        parser.error(f"--jobs {options.jobs} is not usable: give a whole number from 1")
     try:
         whole = not (options.execute_only or options.only)
-        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs)
+        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs or default_jobs())
     except (ValueError, OSError) as error:
         print(f"the book was not built: {error}", file=sys.stderr)
         return 2

@@ -11,12 +11,9 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ from papermill.exceptions import PapermillExecutionError
 
 import status
 from fedvla_lib.config import PROFILES
+from fedvla_lib.workers import side_by_side
 
 PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
@@ -52,7 +50,7 @@ def library_key(root: Path, profile: str) -> str:
     """Return a digest of all that a chapter's results depend on, except the notebook."""
     packages = [path for name in PACKAGES for path in (root / name).rglob("*") if "__pycache__" not in path.parts]
     files = [*sorted(packages), root / "requirements.lock"]
-    return digest([profile.encode(), *(_named_bytes(root, path) for path in files if path.is_file())])
+    return digest([profile.encode(), *(named_bytes(root, path) for path in files if path.is_file())])
 
 
 def notebook_key(notebook: Path, library: str) -> str:
@@ -60,11 +58,12 @@ def notebook_key(notebook: Path, library: str) -> str:
     source = notebook.read_bytes()
     folders = sorted({notebook.parent / name.decode() for name in REFERENCE.findall(source)})
     files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
-    stored = [_named_bytes(notebook.parent.parent, path.resolve()) for path in files]
+    stored = [named_bytes(notebook.parent.parent, path.resolve()) for path in files]
     return digest([library.encode(), notebook.name.encode(), source, *stored])
 
 
-def _named_bytes(root: Path, path: Path) -> bytes:
+def named_bytes(root: Path, path: Path) -> bytes:
+    """Return a file's path below `root` and its content."""
     return path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes()
 
 
@@ -117,7 +116,7 @@ def check_parameters(notebook: Path, parameters: dict[str, object]) -> None:
 def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
     """Return the executed copy of `notebook` in `folder` if its key is unchanged, else None."""
     target, key = folder / notebook.name, notebook_key(notebook, library)
-    if not target.is_file() or (stamp := _stamp(target)).get("key") != key:
+    if not target.is_file() or (stamp := _metadata(target)).get("key") != key:
         return None
     return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
 
@@ -135,32 +134,35 @@ def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time:
     parameters = {"profile": profile}
     check_parameters(notebook, parameters)
     environment = status.environment(notebook, profile)
-    seconds = _execute(notebook, target, parameters)
+    seconds = _execute(notebook, target, parameters, has_bar=at_a_time == 1 and sys.stderr.isatty())
     cost = {"seconds": round(seconds, 1), "at_a_time": at_a_time}
     _finish(target, {"key": key, "profile": profile, **cost, "environment": environment})
     return Chapter(notebook.stem, target, key, seconds, reused=False)
 
 
-def _stamp(executed: Path) -> dict:
-    return nbformat.read(executed, as_version=4).metadata.get("fedvla", {})
+def _metadata(notebook: Path) -> dict:
+    return nbformat.read(notebook, as_version=4).metadata.get("fedvla", {})
 
 
-def _execute(notebook: Path, target: Path, parameters: dict[str, object]) -> float:
+def log_of(target: Path) -> Path:
+    """Return the file with all that the cells of an executed copy print, progress bars too, as they run."""
+    return target.parents[1] / "logs" / f"{target.stem}.log"
+
+
+def _execute(notebook: Path, target: Path, parameters: dict[str, object], has_bar: bool) -> float:
     """Run `notebook` in its folder, as nbmake and readers do; return the wall time in seconds."""
     start = time.monotonic()
-    target.parent.mkdir(parents=True, exist_ok=True)
+    for folder in (target.parent, log_of(target).parent):
+        folder.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
     try:
-        papermill.execute_notebook(
-            str(notebook),
-            str(_unfinished(target)),
-            parameters=parameters,
-            cwd=str(notebook.parent),
-            kernel_name="python3",
-            progress_bar=sys.stderr.isatty(),
-            execution_timeout=CELL_TIMEOUT_S[str(parameters["profile"])],
-            extra_arguments=["--log-level=CRITICAL"],  # silences log messages of kernels; cells still show errors
-        )
+        with open(log_of(target), "w", encoding="utf-8") as log:
+            papermill.execute_notebook(
+                str(notebook), str(_unfinished(target)), parameters=parameters, cwd=str(notebook.parent),
+                kernel_name="python3", progress_bar=has_bar, stdout_file=log, stderr_file=log,
+                execution_timeout=CELL_TIMEOUT_S[str(parameters["profile"])],
+                extra_arguments=["--log-level=CRITICAL"],  # silences log messages of kernels; cells still show errors
+            )  # fmt: skip
     except PapermillExecutionError as error:
         copy = os.path.relpath(_unfinished(target))
         raise BookError(f"{notebook.name}: {error.ename}: {error.evalue.strip()} (see {copy})") from error
@@ -190,51 +192,33 @@ def execute_chapters(
 
     Args:
         prepare: called with the profile if any chapter has to be executed, before the first.
-        jobs: number of chapters executed in parallel; each then takes longer than alone.
+        jobs: chapters executed at a time; one that uses another's run (``fedvla.after`` in its metadata) waits for it.
     """
     library, folder = library_key(root, profile), executed_folder(root, profile)
     notebooks = [path for path in notebooks_of(root) if only in path.stem]
     if not notebooks:
         raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
     chapters = {path: reuse(path, folder, library) for path in notebooks}
-    if not all(chapters.values()):
+    changed = [path for path in notebooks[::-1] if chapters[path] is None]  # the last take longest, so they start first
+    if changed:
         prepare(profile)
     place = {path: f"[{number}/{len(notebooks)}] {path.stem}" for number, path in enumerate(notebooks, start=1)}
-    order = notebooks if jobs == 1 else notebooks[::-1]  # the last chapters take longest, so start them first
-    with _workers(jobs) as submit:
-        changed = [path for path in order if chapters[path] is None]
-        lines = {path: f"{place[path]}, profile {profile} ..." for path in changed}
-        work = {path: submit(_announced, lines[path], path, folder, profile, library, jobs) for path in changed}
-        for path in order:
-            chapters[path] = chapters[path] or work[path]()
+    for path in notebooks:
+        if chapters[path]:
             print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
+    needed = {path: {path.with_stem(name) for name in _metadata(path).get("after", [])} for path in changed}
+    first = sorted(changed, key=lambda path: not any(path in others for others in needed.values()))
+    work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs)
+    order = first if jobs > 1 else changed[::-1]
+    for path, chapters[path] in side_by_side(work, order, jobs, after=needed, preload=()):
+        print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
 
 
-def _announced(line: str, notebook: Path, *options: Any) -> Chapter:
-    print(line, flush=True)
-    return execute(notebook, *options)
-
-
-def _on_one_thread() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # inherited by the kernels
-
-
-@contextmanager
-def _workers(jobs: int) -> Iterator[Callable[..., Callable[[], Chapter]]]:
-    """Yield a function that submits work and returns a function for its result.
-
-    With one job the work runs here when its result is requested. Otherwise it starts at once in other processes:
-    papermill changes the working directory, which threads share.
-    """
-    if jobs == 1:
-        yield partial
-        return
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _on_one_thread)
-    try:
-        yield lambda *work: pool.submit(*work).result
-    finally:
-        pool.shutdown(cancel_futures=True)
+def _announced(place: dict[Path, str], notebook: Path, profile: str, **options: Any) -> Chapter:
+    log = os.path.relpath(log_of(options["folder"] / notebook.name))
+    print(f"{place[notebook]}, profile {profile}, log in {log} ...", flush=True)
+    return execute(notebook, profile=profile, **options)
 
 
 def record_data(profile: str) -> None:

@@ -3,7 +3,7 @@
     python book/tools/keep_costs.py --profile laptop
 
 Reads the executed copies of `make book` and writes `book/reference/costs/<profile>.json`. Measure on an idle
-machine.
+machine, one chapter at a time: ``make book BOOK_JOBS=1``.
 """
 
 import argparse
@@ -31,7 +31,8 @@ def measured_in(executed: Path) -> dict[str, float | None]:
     if "fedvla" not in notebook.metadata:
         raise ValueError(f"{executed.name} was not executed by make book")
     if (together := notebook.metadata["fedvla"].get("at_a_time", 1)) > 1:
-        raise ValueError(f"{executed.name} was executed with {together} at a time: remove it, and run make book first")
+        text = "remove it, and run make book BOOK_JOBS=1 first"
+        raise ValueError(f"{executed.name} was executed with {together} at a time: {text}")
     costs = [
         output["metadata"][MEASURED]
         for cell in notebook.cells

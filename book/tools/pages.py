@@ -8,7 +8,7 @@ import yaml
 
 import library
 import status
-from execution import Chapter, digest
+from execution import Chapter
 from fedvla_lib.files import write_atomically
 from front_page import COMPARISON, OUTCOME, VIDEO_CHAPTER, compared, headline, outcome, video
 
@@ -40,8 +40,8 @@ TITLES = {
 BENCHMARKS = "benchmarks/results"
 
 
-def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> str:
-    """Write pages, executed chapters and configuration to `source` and return a digest of all.
+def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> None:
+    """Write pages, executed chapters and configuration to `source`.
 
     Unchanged files keep their time stamp, so that Sphinx rebuilds only the pages that differ.
     """
@@ -67,9 +67,6 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
             write_atomically(source / path, content)
     for path in [path for path in source.rglob("*") if path.is_file() and path.relative_to(source) not in wanted]:
         path.unlink()
-    parts = [path.as_posix().encode() + b"\0" + content for path, content in sorted(wanted.items())]
-    tools = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]  # what renders, too
-    return digest([*tools, *parts])
 
 
 def _put(wanted: dict[Path, bytes], page: str, mark: bytes, text: Callable[[], str]) -> None:

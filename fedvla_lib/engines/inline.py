@@ -76,7 +76,8 @@ def cached(loaders: client.Loaders) -> client.Loaders:
     # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
     build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
     frames = functools.cache(loaders.open_frames)
-    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)), functools.cache(loaders.shares))
+    shares = functools.cache(loaders.shares)
+    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)), shares)
 
 
 class InlineGrid(Grid):
