@@ -127,8 +127,8 @@ def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
 def _add_table(world: mujoco.MjsBody) -> None:
     """Add the table, 1.2 m square.
 
-    MuJoCo draws a plane as a grid of cells with the third size as their side. One cell per quarter is ten times faster
-    than cells of 1 cm. Only the far edge, the one in view of a camera, is a strip of them: its pixels depend on them.
+    MuJoCo draws a plane as a grid of cells with the third size as their side. Few large cells take a sixth of the time
+    of 1 cm cells. Only the far edge, the one that a camera sees, is a row of these: its pixels depend on their size.
     """
     look = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, rgba=(*TABLE_RGB, 1.0))
     world.add_geom(name=TABLE, pos=(0.0025, 0.0, 0.0), size=(0.5975, 0.6, 1.2), **look)
