@@ -12,6 +12,7 @@ turns to the arm's left, positive shoulder_lift leans forward, positive elbow_fl
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,8 +53,8 @@ class So100Env(gymnasium.Env):
             `camera_images` does not depend on it.
         lab: camera poses, light, colours and calibration of the arm.
         jitter: above 0, a new lab without calibration offsets is drawn for every episode, with this spread.
-        renderer_of: share this environment's renderer, since opening one is slow; it must have the same task and image
-            size, and stay open.
+        renderer_of: share this environment's renderer, since opening one is slow, and copy its scene if the task is
+            the same; it must have the same image size, and stay open.
 
     Raises:
         ValueError: unknown task, camera or render mode, or an unusable image size.
@@ -79,10 +80,12 @@ class So100Env(gymnasium.Env):
         self.cameras = tuple(cameras)
         self.lab, self._jitter = lab, jitter
         self._max_episode_steps = self._task.horizon_steps
-        self.model = scene.build_scene(self._task, image_size)
+        copied = renderer_of is not None and renderer_of._task == self._task
+        self.model = copy(renderer_of.model) if copied else scene.build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: SceneRenderer | None = None
-        self._renderer_of = renderer_of  # never self: a reference cycle would be freed late, in any thread
+        # Never self: a reference cycle would be freed late, in any thread.
+        self._renderer_of = renderer_of and (renderer_of._renderer_of or renderer_of)
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
         self._touches = _touches(self.model)
