@@ -8,6 +8,7 @@ import sys
 import weakref
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -480,6 +481,25 @@ def test_frames_survive_the_end_of_another_environment():
     np.testing.assert_array_equal(env.render(), before)
     env.close()
     np.testing.assert_array_equal(env.render(), before)  # rendering reopens a closed renderer
+
+
+def test_an_image_drawn_in_two_layers_is_the_one_drawn_at_once():
+    """Environments of several tasks share a renderer; each is in a lab of its own, which changes, too."""
+    rng, first = np.random.default_rng(0), So100Env("lift", image_size=96)
+    envs = [So100Env(name, image_size=96, renderer_of=first) for name in ("lift", "sort", "point_circle")]
+    envs.append(So100Env("sort", image_size=96, renderer_of=envs[1]))
+    at_once = [mujoco.Renderer(env.model, 96, 96) for env in envs]
+    for seed in range(24):
+        env, renderer = envs[seed % len(envs)], at_once[seed % len(envs)]
+        if seed % 3:
+            env.lab = draw_lab("drawn", rng)
+        env.model.mat_rgba[:, :3] = rng.uniform(size=3)  # the base's colour, which is the same in all labs
+        env.reset(seed=seed)
+        for _ in range(4):
+            images = env.step(HOME + rng.uniform(-40, 40, NUM_JOINTS))[0]["pixels"]
+            for camera in CAMERAS:
+                renderer.update_scene(env.data, camera)
+                np.testing.assert_array_equal(images[camera], renderer.render())
 
 
 def test_an_environment_that_nobody_holds_is_gone_at_once():

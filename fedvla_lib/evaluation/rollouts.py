@@ -52,9 +52,11 @@ def evaluate(
     """
     with_video = set(seeds[:num_videos] if videos_dir else ())
     rows = []
-    with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar:
+    bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
+    with bar, closing(So100Env(image_size=image_size)) as drawing:
         for task in tasks:
-            for episode in _episodes(actor, task, seeds, image_size, labs, with_video, bar):
+            first = So100Env(task, image_size, renderer_of=drawing)
+            for episode in _episodes(actor, first, seeds, labs, with_video, bar):
                 video = save_rollout(episode, Path(videos_dir)) if episode.images else None
                 lab = _lab(labs, episode.seed).name
                 rows.append(row(episode) | {"lab": lab, "video": str(video) if video else None})
@@ -62,22 +64,20 @@ def evaluate(
 
 
 def _episodes(
-    actor: Actor, task: str, seeds: Sequence[int], image_size: int, labs: Sequence[Lab], with_video: set[int], bar: tqdm
+    actor: Actor, first: So100Env, seeds: Sequence[int], labs: Sequence[Lab], with_video: set[int], bar: tqdm
 ) -> Iterator[Episode]:
     """Yield an episode for each seed; an actor with `act_together` drives up to `AT_ONCE` environments in one batch."""
     together = getattr(actor, "act_together", act_in_turn)
     size = min(len(seeds), 1 if together is act_in_turn else AT_ONCE)
-    first = So100Env(task, image_size)
-    envs = [first, *(So100Env(task, image_size, renderer_of=first) for _ in range(1, size))]
-    with closing(first):
-        for start in range(0, len(seeds), max(1, size)):
-            group = seeds[start : start + size]
-            for env, seed in zip(envs, group, strict=False):
-                env.lab = _lab(labs, seed)
-                env.cameras = CAMERAS if seed in with_video else ()  # none: render only what the actor observes
-            actors = [actor] if size == 1 else [copy(actor) for _ in group]
-            yield from run_episodes(envs[: len(group)], actors, group, together)
-            bar.update(len(group))
+    envs = [first, *(So100Env(first.task, first.image_size, renderer_of=first) for _ in range(1, size))]
+    for start in range(0, len(seeds), max(1, size)):
+        group = seeds[start : start + size]
+        for env, seed in zip(envs, group, strict=False):
+            env.lab = _lab(labs, seed)
+            env.cameras = CAMERAS if seed in with_video else ()  # none: render only what the actor observes
+        actors = [actor] if size == 1 else [copy(actor) for _ in group]
+        yield from run_episodes(envs[: len(group)], actors, group, together)
+        bar.update(len(group))
 
 
 def _lab(labs: Sequence[Lab], seed: int) -> Lab:

@@ -10,24 +10,64 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 
+PIXEL = "V3"  # NumPy's type of three bytes, much faster to copy than three numbers
+BACKGROUNDS = 16  # kept by a renderer: those of two cameras in eight labs
+
 
 class SceneRenderer(mujoco.Renderer):
-    """A renderer of fixed cameras that can be closed without breaking the other renderers of the process."""
+    """A renderer of fixed cameras that can be closed without breaking the other renderers of the process.
+
+    Table, base and sky are drawn once, with their depth; what moves is drawn for each image and put in front of them.
+    The pixels are those of drawing all at once, as long as nothing is transparent.
+    """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         super().__init__(model, height, width)
         self._view, self._options = mujoco.MjvCamera(), mujoco.MjvOption()
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._fixed = np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0)  # geoms
+        self._backgrounds: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         # At exit MuJoCo closes its OpenGL display before Python destroys the renderers that still use it.
         atexit.register(_close, weakref.ref(self))
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> np.ndarray:
         """Return the image, uint8 (height, width, 3); `model` must have the meshes of the model given at creation."""
         self._view.fixedcamid = model.camera(camera).id
-        categories = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, self._options, None, self._view, categories, self.scene)
         with garbage_collection_paused():
-            return self.render()
+            self._gl_context.make_current()
+            image, nearness = self._layer(model, data, mujoco.mjtCatBit.mjCAT_DYNAMIC)
+            behind, behind_nearness = self._background(model, data)
+        hidden = behind_nearness > nearness
+        np.copyto(image.view(PIXEL), behind.view(PIXEL), where=hidden[..., None])
+        return image[::-1].copy()  # OpenGL's first row is the lowest
+
+    def _background(self, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Return the layer of what is fixed to the world, drawn anew if camera, light, a place or a colour changed."""
+        shown = (
+            data.cam_xpos, data.cam_xmat, model.cam_fovy, data.light_xpos, data.light_xdir, model.light_diffuse,
+            model.vis.headlight.ambient, model.vis.headlight.diffuse, model.mat_rgba, model.geom_rgba[self._fixed],
+            data.geom_xpos[self._fixed], data.geom_xmat[self._fixed],
+        )  # fmt: skip
+        key = b"".join([bytes([self._view.fixedcamid]), *(values.tobytes() for values in shown)])
+        if key not in self._backgrounds:
+            if len(self._backgrounds) == BACKGROUNDS:
+                del self._backgrounds[next(iter(self._backgrounds))]  # the oldest
+            self._backgrounds[key] = self._layer(model, data, mujoco.mjtCatBit.mjCAT_STATIC)
+        return self._backgrounds[key]
+
+    def _layer(self, model: mujoco.MjModel, data: mujoco.MjData, category: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draw what is fixed to the world (mjCAT_STATIC), with the sky, or what is not (mjCAT_DYNAMIC).
+
+        Returns:
+            From the lowest row up: the colours, uint8 (height, width, 3), and float32 (height, width) that is larger
+            for nearer points, and 0 where nothing is.
+        """
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = category == mujoco.mjtCatBit.mjCAT_STATIC
+        mujoco.mjv_updateScene(model, data, self._options, None, self._view, category, self.scene)
+        image, nearness = np.empty((self.height, self.width, 3), np.uint8), np.empty((self.height, self.width), "f4")
+        mujoco.mjr_render(self._rect, self.scene, self._mjr_context)
+        mujoco.mjr_readPixels(image, nearness, self._rect, self._mjr_context)
+        return image, nearness
 
     def close(self) -> None:
         """Free the buffers in this renderer's own OpenGL context; MuJoCo frees them in whichever one is current.

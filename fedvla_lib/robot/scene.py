@@ -21,7 +21,7 @@ JOINTS = tuple(name.removesuffix(".pos") for name in JOINT_NAMES)  # joint and a
 GRASP_SITE = "grasp"
 CUBES = ("cube", "other_cube")
 ZONES = ("zone", "other_zone")
-TABLE = "table"
+TABLE, TABLE_EDGE = "table", "table_edge"
 LIGHT = "light"
 OUT_OF_SIGHT_M = (2.0, 0.0)  # behind the front camera: place of a second cube that the episode does not use
 TIMESTEP_S = 0.005
@@ -117,11 +117,22 @@ def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
         rgb1=(0.93, 0.95, 0.98), rgb2=(0.80, 0.86, 0.93), width=64, height=384,
     )  # fmt: skip
     world = spec.worldbody
-    world.add_geom(name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.6, 0.6, 0.01), rgba=(*TABLE_RGB, 1.0))
+    _add_table(world)
     world.add_light(
         name=LIGHT, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=(0.3, 0.5, 1.5), dir=(-0.2, -0.4, -1.0),
         diffuse=(LAMP,) * 3, specular=(0,) * 3, castshadow=False,
     )  # fmt: skip
+
+
+def _add_table(world: mujoco.MjsBody) -> None:
+    """Add the table, 1.2 m square.
+
+    MuJoCo draws a plane as a grid of cells with the third size as their side. Few large cells take a sixth of the time
+    of 1 cm cells. Only the far edge, the one that a camera sees, is a row of these: its pixels depend on their size.
+    """
+    look = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, rgba=(*TABLE_RGB, 1.0))
+    world.add_geom(name=TABLE, pos=(0.0025, 0.0, 0.0), size=(0.5975, 0.6, 1.2), **look)
+    world.add_geom(name=TABLE_EDGE, pos=(-0.595, 0.0, 0.0), size=(0.005, 0.6, 0.01), contype=0, conaffinity=0, **look)
 
 
 def _add_cube(spec: mujoco.MjSpec, name: str) -> None:
@@ -171,7 +182,8 @@ def apply_lab(model: mujoco.MjModel, lab: Lab) -> None:
     model.vis.headlight.ambient[:] = AMBIENT * lab.brightness
     model.vis.headlight.diffuse[:] = HEADLIGHT * lab.brightness
     model.light(LIGHT).diffuse[:] = LAMP * lab.brightness
-    model.geom(TABLE).rgba[:3] = _recolored(TABLE_RGB, lab.table_change)
+    for name in (TABLE, TABLE_EDGE):
+        model.geom(name).rgba[:3] = _recolored(TABLE_RGB, lab.table_change)
 
 
 def place_objects(model: mujoco.MjModel, data: mujoco.MjData, layout: Layout, lab: Lab) -> None:

@@ -10,7 +10,9 @@ turns to the arm's left, positive shoulder_lift leans forward, positive elbow_fl
 "closed" and "open" are the limits of the gripper's joint range in the model.
 """
 
+import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +35,7 @@ HOME_NOISE = 2.0  # half range of the uniform noise on each joint at reset, in i
 IMAGE_SIZES = (16, 1024)  # smallest and largest camera image, in pixels
 SUBSTEPS = round(1 / (FPS * scene.TIMESTEP_S))
 FLUNG_SPEED_MPS = 0.10  # a cube not touched during a control step but faster than this at its end was flung
+NOT_THE_ARM = ("world", *scene.CUBES, *scene.ZONES)  # bodies
 
 
 class So100Env(gymnasium.Env):
@@ -50,8 +53,8 @@ class So100Env(gymnasium.Env):
             `camera_images` does not depend on it.
         lab: camera poses, light, colours and calibration of the arm.
         jitter: above 0, a new lab without calibration offsets is drawn for every episode, with this spread.
-        renderer_of: share this environment's renderer, since opening one is slow; it must have the same task and image
-            size, and stay open.
+        renderer_of: share this environment's renderer, since opening one is slow, and copy its scene if the task is
+            the same; it must have the same image size, and stay open.
 
     Raises:
         ValueError: unknown task, camera or render mode, or an unusable image size.
@@ -77,13 +80,15 @@ class So100Env(gymnasium.Env):
         self.cameras = tuple(cameras)
         self.lab, self._jitter = lab, jitter
         self._max_episode_steps = self._task.horizon_steps
-        self.model = scene.build_scene(self._task, image_size)
+        copied = renderer_of is not None and renderer_of._task == self._task
+        self.model = copy(renderer_of.model) if copied else scene.build_scene(self._task, image_size)
         self.data = mujoco.MjData(self.model)
         self._renderer: SceneRenderer | None = None
-        self._renderer_of = renderer_of  # never self: a reference cycle would be freed late, in any thread
+        # Never self: a reference cycle would be freed late, in any thread.
+        self._renderer_of = renderer_of and (renderer_of._renderer_of or renderer_of)
         self.action_space = spaces.Box(*self._range(), dtype=np.float32)
         self.observation_space = self._observation_space()
-        self._parts = _parts(self.model)
+        self._touches = _touches(self.model)
         self.layout = draw_layout(self._task, np.random.default_rng(0))
         self._needs_reset = True
 
@@ -158,7 +163,8 @@ class So100Env(gymnasium.Env):
         self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
         touched = self._advance()
         task = self._task
-        first, *others = (self._measure(index, touched) for index in range(len(self._histories)))
+        now = self._touching()
+        first, *others = (self._measure(index, touched, now) for index in range(len(self._histories)))
         self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
         terminated = self._streak >= task.hold_steps
@@ -187,32 +193,33 @@ class So100Env(gymnasium.Env):
         self.data.qpos[:NUM_JOINTS] = radians
         self.data.ctrl[:] = radians
 
-    def _advance(self) -> set[str]:
-        """Simulate one control step; return the cubes that the arm touched during it."""
+    def _advance(self) -> set[tuple[str, str]]:
+        """Simulate one control step; return what touched during it, see `_touching`."""
         touched = set()
         for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
-            touched |= {name for name in scene.CUBES[: len(self._histories)] if self._touching(name)}
+            touched |= self._touching()
         mujoco.mj_forward(self.model, self.data)  # update positions and contacts to the final state
         return touched
 
-    def _touching(self, cube: str) -> set[str]:
-        """Parts of the arm in contact with the cube: "fixed", "moving" (the jaws) or "arm"."""
-        pairs = self.data.contact.geom[: self.data.ncon]
-        geom = self.model.geom(cube).id
-        others = pairs[(pairs == geom).any(axis=1)]
-        return {self._parts[other] for other in others[others != geom]} - {""}
+    def _touching(self) -> set[tuple[str, str]]:
+        """Return the pairs in contact of a cube and a part of the arm: "fixed", "moving" (the jaws) or "arm"."""
+        touches = self._touches  # a dict of Python numbers: this runs 20 times a control step, on a few contacts
+        return {touches[pair] for pair in map(tuple, self.data.contact.geom.tolist()) if pair in touches}
 
-    def _measure(self, index: int, touched_in_step: set[str]) -> TaskState:
-        """Update the history of one cube and return the input of the success predicates."""
+    def _measure(self, index: int, touched: set[tuple[str, str]], now: set[tuple[str, str]]) -> TaskState:
+        """Update the history of one cube and return the input of the success predicates.
+
+        `touched`: contacts during the control step, `now`: at its end, both as `_touching` returns them.
+        """
         name, history = scene.CUBES[index], self._histories[index]
-        parts, cube_m = self._touching(name), tuple(self.data.body(name).xpos.tolist())
+        parts, cube_m = {part for cube, part in now if cube == name}, tuple(self.data.body(name).xpos.tolist())
         hand_m = tuple(self.data.site(scene.GRASP_SITE).xpos.tolist())
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
         history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
         history.carried |= held and clearance_m > CARRY_CLEARANCE_M
-        history.flung |= name not in touched_in_step and speed_mps > FLUNG_SPEED_MPS
+        history.flung |= speed_mps > FLUNG_SPEED_MPS and all(name != cube for cube, _ in touched)
         return TaskState(
             clearance_m=clearance_m, peak_clearance_m=history.peak_clearance_m, speed_mps=speed_mps,
             zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts), carried=history.carried,
@@ -284,8 +291,8 @@ def _check_joints(values: np.ndarray, what: str) -> np.ndarray:
     target = np.asarray(values, dtype=np.float64)
     if target.shape != (NUM_JOINTS,):
         raise ValueError(f"{what} has shape {target.shape}: give ({NUM_JOINTS},), one value for each of {scene.JOINTS}")
-    for name, value in zip(scene.JOINTS, target, strict=True):
-        if not np.isfinite(value):
+    for name, value in zip(scene.JOINTS, target.tolist(), strict=True):
+        if not math.isfinite(value):
             raise ValueError(f"{what} for {name} is {value}: give a finite number")
     return target
 
@@ -301,12 +308,13 @@ def _check_view(image_size: int, render_mode: str | None, cameras: tuple[str, ..
             raise ValueError(f"unknown camera {camera!r}: choose from {', '.join(CAMERAS)}")
 
 
-def _parts(model: mujoco.MjModel) -> list[str]:
-    """The arm's part that each geom belongs to: "fixed", "moving" (the jaws), "arm", or "" if it is not the arm's."""
+def _touches(model: mujoco.MjModel) -> dict[tuple[int, int], tuple[str, str]]:
+    """Return the cube and the part of the arm ("fixed", "moving" or "arm") for each pair of their geoms' ids."""
     jaws = {"Fixed_Jaw": "fixed", "Moving_Jaw": "moving"}
-    others = dict.fromkeys(("world", *scene.CUBES, *scene.ZONES), "")
     bodies = [model.body(body).name for body in model.geom_bodyid]
-    return [jaws.get(name, others.get(name, "arm")) for name in bodies]
+    arm = [(geom, jaws.get(body, "arm")) for geom, body in enumerate(bodies) if body not in NOT_THE_ARM]
+    cubes = [(geom, body) for geom, body in enumerate(bodies) if body in scene.CUBES]
+    return {pair: (cube, part) for a, part in arm for b, cube in cubes for pair in ((a, b), (b, a))}
 
 
 gymnasium.register(id=ENV_ID, entry_point="fedvla_lib.robot.sim:So100Env")
