@@ -66,7 +66,8 @@ class Deployment:
         log = self.log(partition_id)
         log.parent.mkdir(exist_ok=True)
         connected, untrusted = _count(log), _count(log, UNTRUSTED)
-        node = processes.start(self._command(partition_id), superlink.flower_environment(log.parent), log)
+        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
+        node = processes.start(self._command(partition_id), environment, log)
         self.nodes[partition_id] = node
         who = f"the SuperNode of client {partition_id}"
         processes.wait_until(lambda: _count(log) > connected or _count(log, UNTRUSTED) > untrusted, node, log, who)
