@@ -12,6 +12,7 @@ the script; if there is no server, it runs the script in the ordinary way.
 import gc
 import importlib
 import json
+import logging
 import os
 import runpy
 import select
@@ -50,6 +51,7 @@ def serve(modules: list[str]) -> list[str]:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks need not be waited for
     for module in modules:
         importlib.import_module(module)
+    logging.getLogger().handlers.clear()  # LeRobot adds one, and Flower's lines would appear twice
     gc.freeze()  # collections in a fork would copy the memory that it shares
     while True:
         connection, _ = listener.accept()

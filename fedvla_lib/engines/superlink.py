@@ -6,6 +6,7 @@ Flower's own `flwr run` gives the SuperLink that it starts only 15 s, and exits 
 import json
 import os
 import re
+import shutil
 import ssl
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fedvla_lib.engines.credentials import ServerFiles
-from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, program, reason, start, stop, wait_until
+from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, reason, start, stop, wait_until
 from fedvla_lib.engines.warm_start import ray_python, warm_start
 
 STATUS_TRIES, POLL_S = 30, 1.0
@@ -51,7 +52,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the run was not accepted or timed out.
         """
-        command = [program("flwr"), "run", str(app), self.connection, *options, "--stream"]
+        command = [self._flwr(), "run", str(app), self.connection, *options, "--stream"]
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
@@ -71,7 +72,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the command failed.
         """
-        arguments = [program("flwr"), *command, "--format", "json"]
+        arguments = [self._flwr(), *command, "--format", "json"]
         done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(done.stderr or done.stdout)}")
@@ -79,6 +80,9 @@ class SuperLink:
         if not answer.get("success", True):
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(answer.get('error-message', done.stdout))}")
         return answer
+
+    def _flwr(self) -> str:
+        return shutil.which("flwr", path=self.environment["PATH"]) or "flwr"
 
 
 @contextmanager
