@@ -133,9 +133,15 @@ def running_deployment(
             for k in range(num_clients):
                 deployment.wait_for_node(k)
             yield deployment
+            _kill(nodes)  # before the SuperLink, which would wait for their connections to end
     finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
-        for node in nodes.values():  # killed, since it would try for long to take leave of the SuperLink
-            processes.stop(node, (signal.SIGKILL,))
+        _kill(nodes)
+
+
+def _kill(nodes: dict[int, subprocess.Popen]) -> None:
+    """Kill SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
+    for node in nodes.values():
+        processes.stop(node, (signal.SIGKILL,))
 
 
 def run_deployed(

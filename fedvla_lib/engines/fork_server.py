@@ -49,10 +49,12 @@ def serve(modules: list[str]) -> list[str]:
     """
     listener = socket.socket(fileno=os.dup(0))
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks need not be waited for
+    gc.disable()  # a fifth of the time would be collections
     for module in modules:
         importlib.import_module(module)
-    logging.getLogger().handlers.clear()  # LeRobot adds one, and Flower's lines would appear twice
     gc.freeze()  # collections in a fork would copy the memory that it shares
+    gc.enable()
+    logging.getLogger().handlers.clear()  # LeRobot adds one, and Flower's lines would appear twice
     while True:
         connection, _ = listener.accept()
         if os.fork() == 0:
