@@ -14,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import yaml
 from cryptography import x509
@@ -29,6 +30,7 @@ from fedvla_lib.config import from_profile, to_run_config
 from fedvla_lib.data import record
 from fedvla_lib.engines import credentials, deployment, processes, superlink
 from fedvla_lib.engines.inline import run_inline
+from fedvla_lib.engines.warm_start import FORK_SERVER
 from fedvla_lib.federation import client, client_app
 from fedvla_lib.files import write_json
 
@@ -191,6 +193,15 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     assert "is a completed run" in said.err and said.err.count("\n") == 1 and not said.out
 
 
+def test_a_deployment_goes_on_when_its_fork_servers_are_killed(standing, tiny):
+    """Each program is then started in the ordinary way."""
+    servers = [one for one in psutil.Process().children() if str(FORK_SERVER) in one.cmdline()]
+    for server in servers:
+        server.kill()
+    deployment.submit(standing, replace(tiny, num_server_rounds=1), 540)
+    assert servers and len(run_folder.read_metrics(max(run_folder.run_folders(tiny)), "train")) == 2
+
+
 @pytest.mark.unit
 def test_a_run_is_told_from_another_one_that_began_later_in_the_same_place(tiny):
     before = run_folder.run_folders(tiny)
@@ -213,6 +224,7 @@ def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_end
     flags = [f"--{name}={value}" for name, value in given(config).items()]
     command = [sys.executable, "-m", "fedvla_lib.cli", "deploy", "--profile", "tiny", "--tls", "--auth", *flags]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    buffered["FEDVLA_MARK"] = mark = str(tmp_path)
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=buffered, start_new_session=True,
         preexec_fn=heed_interrupts,
@@ -226,18 +238,19 @@ def test_ctrl_c_stops_everything_that_was_started_and_leaves_the_rounds_that_end
     os.killpg(process.pid, signal.SIGINT)
     warned = process.communicate(timeout=60)[1]
     assert process.returncode == 130 and "interrupted: every process is stopped" in warned
-    assert processes.is_free(int(port)) and not left_over(port)
+    assert processes.is_free(int(port)) and not left_over(mark)
     (root,) = run_folder.run_folders(config)
     assert run_folder.read_stamp(root)["status"] == "interrupted"
     assert load_file(root / "global_model/round_1/model.safetensors")
     assert set(run_folder.read_metrics(root, "train").query("round == 1").who) == {"client_0", "client_1"}
 
 
-def left_over(port: str) -> list[str]:
-    """Processes that still name a SuperLink; Flower's helpers check every few seconds whether their parent lives."""
+def left_over(mark: str) -> list[psutil.Process]:
+    """Processes that inherited a mark; Flower's helpers check every few seconds whether their parent lives."""
     deadline = time.monotonic() + 15
     while True:
-        found = subprocess.run(["pgrep", "-f", f"127.0.0.1:{port}"], capture_output=True, text=True).stdout.split()
+        running = psutil.process_iter(["environ"])
+        found = [one for one in running if (one.info["environ"] or {}).get("FEDVLA_MARK") == mark]
         if not found or time.monotonic() > deadline:
             return found
         time.sleep(1)

@@ -13,7 +13,7 @@ from flwr.superlink.grid import InMemoryGrid
 from fedvla_lib.config import from_profile, to_run_config
 from fedvla_lib.engines.inline import RUN_ID, InlineGrid, claim_identity
 from fedvla_lib.federation import server_app
-from fedvla_lib.federation.throttled_grid import MESSAGES_AT_ONCE, ThrottledGrid, for_simulation
+from fedvla_lib.federation.throttled_grid import MESSAGES_AT_ONCE, ThrottledGrid, for_runtime
 
 pytestmark = pytest.mark.unit
 CLIENTS = 10
@@ -64,8 +64,8 @@ def in_memory(kind=InMemoryGrid) -> InMemoryGrid:
 
 
 def test_only_the_grid_of_the_simulation_is_limited():
-    assert isinstance(for_simulation(in_memory()), ThrottledGrid)
-    assert for_simulation(inline := grid_of()) is inline
+    assert isinstance(for_runtime(in_memory()), ThrottledGrid)
+    assert for_runtime(inline := grid_of()) is inline
 
 
 class Asked(InMemoryGrid):

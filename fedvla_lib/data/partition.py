@@ -6,14 +6,16 @@ with an episode as a row and its task as the label. This module does not know im
 
 import warnings
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from datasets import Dataset
-from flwr_datasets.partitioner import DirichletPartitioner, PathologicalPartitioner
-from flwr_datasets.partitioner.partitioner import Partitioner
 
 from fedvla_lib.config import PARTITIONS
+
+if TYPE_CHECKING:
+    from flwr_datasets.partitioner.partitioner import Partitioner
 
 MAX_DRAWS = 20  # seeds tried for a Dirichlet partition without an empty client; each draws up to 11 times
 
@@ -106,6 +108,8 @@ def _by_task(table: pd.DataFrame, num_clients: int) -> list[list[int]]:
             names = ", ".join(task for task in tasks if labels[task] == label)
             message = f"{sharing} clients cannot share the {available[label]} episodes of {names}: use fewer clients"
             raise ValueError(message)
+    from flwr_datasets.partitioner import PathologicalPartitioner  # loads seaborn and SciPy: a second
+
     partitioner = PathologicalPartitioner(
         num_clients, "label", num_classes_per_partition=1, class_assignment_mode="deterministic", shuffle=False
     )
@@ -124,6 +128,8 @@ def _by_lab(table: pd.DataFrame, num_clients: int) -> list[list[int]]:
 
 def _dirichlet(table: pd.DataFrame, num_clients: int, seed: int, alpha: float) -> list[list[int]]:
     """Use flwr-datasets' Dirichlet partitioner, with more draws than its own 11."""
+    from flwr_datasets.partitioner import DirichletPartitioner
+
     for draw in range(MAX_DRAWS):
         generator_seed = int(np.random.SeedSequence([seed, draw]).generate_state(1)[0])
         partitioner = DirichletPartitioner(
@@ -142,6 +148,6 @@ def _dirichlet(table: pd.DataFrame, num_clients: int, seed: int, alpha: float) -
     )
 
 
-def _ids(partitioner: Partitioner, table: pd.DataFrame, num_clients: int) -> list[list[int]]:
+def _ids(partitioner: "Partitioner", table: pd.DataFrame, num_clients: int) -> list[list[int]]:
     partitioner.dataset = Dataset.from_pandas(table, preserve_index=False)
     return [list(partitioner.load_partition(client)["episode_id"]) for client in range(num_clients)]

@@ -64,11 +64,20 @@ class Deployment:
 
     def _try_node(self, partition_id: int) -> None:
         log = self.log(partition_id)
+        before = _count(log), _count(log, UNTRUSTED)
+        self.launch_node(partition_id)
+        self.wait_for_node(partition_id, *before)
+
+    def launch_node(self, partition_id: int) -> None:
+        """Start the SuperNode of a client, and do not wait."""
+        log = self.log(partition_id)
         log.parent.mkdir(exist_ok=True)
-        connected, untrusted = _count(log), _count(log, UNTRUSTED)
-        node = processes.start(self._command(partition_id), superlink.flower_environment(log.parent), log)
-        self.nodes[partition_id] = node
-        who = f"the SuperNode of client {partition_id}"
+        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
+        self.nodes[partition_id] = processes.start(self._command(partition_id), environment, log)
+
+    def wait_for_node(self, partition_id: int, connected: int = 0, untrusted: int = 0) -> None:
+        """Wait until a SuperNode's log says more often than before that it was accepted, as `start_node` does."""
+        node, log, who = self.nodes[partition_id], self.log(partition_id), f"the SuperNode of client {partition_id}"
         processes.wait_until(lambda: _count(log) > connected or _count(log, UNTRUSTED) > untrusted, node, log, who)
         if _count(log) == connected:  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
@@ -116,15 +125,23 @@ def running_deployment(
     nodes: dict[int, subprocess.Popen] = {}
     try:
         with superlink.local_superlink(folder, *options, files=files) as link:
-            for key in keys:
-                link.ask("supernode", "register", str(key.public), CONNECTION)
             deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients, nodes)
+            for k in range(num_clients):  # the next is registered while this one starts
+                if auth:
+                    link.ask("supernode", "register", str(keys[k].public), CONNECTION)
+                deployment.launch_node(k)
             for k in range(num_clients):
-                deployment.start_node(k)
+                deployment.wait_for_node(k)
             yield deployment
+            _kill(nodes)  # before the SuperLink, which would wait for their connections to end
     finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
-        for node in nodes.values():  # killed, since it would try for long to take leave of the SuperLink
-            processes.stop(node, (signal.SIGKILL,))
+        _kill(nodes)
+
+
+def _kill(nodes: dict[int, subprocess.Popen]) -> None:
+    """Kill SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
+    for node in nodes.values():
+        processes.stop(node, (signal.SIGKILL,))
 
 
 def run_deployed(

@@ -21,11 +21,15 @@ class FlowerRunError(RuntimeError):
     """The SuperLink did not start, or the run did not complete; the message quotes Flower's log."""
 
 
-def start(command: list[str], environment: dict[str, str], log: Path) -> subprocess.Popen:
+def start(
+    command: list[str], environment: dict[str, str], log: Path, stdin: socket.socket | None = None
+) -> subprocess.Popen:
     """Start a program in a new session, so that `stop` also ends its child processes."""
     command = [program(command[0]), *command[1:]]
     with open(log, "ab") as output:
-        return subprocess.Popen(command, env=environment, stdout=output, stderr=output, start_new_session=True)
+        return subprocess.Popen(
+            command, env=environment, stdin=stdin, stdout=output, stderr=output, start_new_session=True
+        )
 
 
 def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, what: str) -> None:
@@ -40,7 +44,7 @@ def wait_until(is_up: Callable[[], bool], process: subprocess.Popen, log: Path, 
             raise FlowerRunError(f"{what} ended with status {process.poll()}; {reason(log)}")
         if time.monotonic() > deadline:
             raise FlowerRunError(f"{what} was not ready within {STARTUP_S:.0f} s; {reason(log)}")
-        time.sleep(0.5)
+        time.sleep(0.1)
 
 
 def stop(

@@ -6,7 +6,7 @@ Flower's own `flwr run` gives the SuperLink that it starts only 15 s, and exits 
 import json
 import os
 import re
-import shlex
+import shutil
 import ssl
 import subprocess
 import sys
@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from fedvla_lib.engines.credentials import ServerFiles
-from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, program, reason, start, stop, wait_until
+from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, reason, start, stop, wait_until
+from fedvla_lib.engines.warm_start import ray_python, warm_start
 
-STATUS_TRIES, POLL_S = 6, 5.0
+STATUS_TRIES, POLL_S = 30, 1.0
 COMPLETED = "finished:completed"
 OFFLINE = {  # no telemetry or update checks
     "FLWR_TELEMETRY_ENABLED": "0",
@@ -29,6 +30,7 @@ OFFLINE = {  # no telemetry or update checks
     "FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION": "1",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
+PROMPT = {"FLWR_SUPEREXEC_TASK_POLL_INTERVAL": "0.1"}  # seconds until Flower sees that a process is to be started
 CONNECTION = "book"
 
 
@@ -50,7 +52,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the run was not accepted or timed out.
         """
-        command = [program("flwr"), "run", str(app), self.connection, *options, "--stream"]
+        command = [self._flwr(), "run", str(app), self.connection, *options, "--stream"]
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
@@ -70,7 +72,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the command failed.
         """
-        arguments = [program("flwr"), *command, "--format", "json"]
+        arguments = [self._flwr(), *command, "--format", "json"]
         done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(done.stderr or done.stdout)}")
@@ -78,6 +80,9 @@ class SuperLink:
         if not answer.get("success", True):
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(answer.get('error-message', done.stdout))}")
         return answer
+
+    def _flwr(self) -> str:
+        return shutil.which("flwr", path=self.environment["PATH"]) or "flwr"
 
 
 @contextmanager
@@ -92,7 +97,6 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
         FlowerRunError: the SuperLink did not answer within two minutes.
     """
     port = free_port()
-    environment = flower_environment(home)
     secure = f"root-certificates = {json.dumps(str(files.authority))}" if files else "insecure = true"
     connection = f'[superlink.{CONNECTION}]\naddress = "127.0.0.1:{port}"\n{secure}\n'
     (home / "config.toml").write_text(f'[superlink]\ndefault = "{CONNECTION}"\n\n{connection}')
@@ -101,12 +105,13 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
         protection = ["--ssl-ca-certfile", str(files.authority), "--ssl-certfile", str(files.certificate)]
         protection += ["--ssl-keyfile", str(files.key)]
     command = ["flower-superlink", *protection, *options, "--host", "127.0.0.1", "--port", str(port)]
-    process = start(command, environment, log := home / "superlink.log")
-    try:
-        wait_until(lambda: answers(port, files), process, log, "the SuperLink")
-        yield SuperLink(environment, home / "run.log", port, files)
-    finally:
-        stop(process)
+    with warm_start(flower_environment(home), home / "fork_server.log") as environment:
+        process = start(command, environment, log := home / "superlink.log")
+        try:
+            wait_until(lambda: answers(port, files), process, log, "the SuperLink")
+            yield SuperLink(environment, home / "run.log", port, files)
+        finally:
+            stop(process)
 
 
 def flower_environment(home: Path) -> dict[str, str]:
@@ -116,9 +121,8 @@ def flower_environment(home: Path) -> dict[str, str]:
     """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # they call each other
     plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "CLICOLOR_FORCE")}
-    # Ray pastes this interpreter's path into a shell command unquoted, which fails if a folder's name has a space.
-    ray = {"RAY_JOB_CONFIG_JSON_ENV_VAR": json.dumps({"runtime_env": {"py_executable": shlex.quote(sys.executable)}})}
-    return {**plain, **OFFLINE, **ray, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
+    ray = ray_python(sys.executable)
+    return {**plain, **OFFLINE, **PROMPT, **ray, "NO_COLOR": "1", "FLWR_HOME": str(home), "PATH": path}
 
 
 def require_completed(link: SuperLink, run_id: str) -> None:

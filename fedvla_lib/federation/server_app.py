@@ -22,7 +22,7 @@ from fedvla_lib.federation.client import LOADERS, Loaders, kept_between_rounds
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
-from fedvla_lib.federation.throttled_grid import for_simulation
+from fedvla_lib.federation.throttled_grid import for_runtime
 from fedvla_lib.policy import model
 from fedvla_lib.policy.parameters import Arrays, load_arrays, shapes_of
 from fedvla_lib.robot.tasks import check_tasks
@@ -62,7 +62,7 @@ def build(
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(for_simulation(grid), config, run, loaders, progress, states)
+            federate(for_runtime(grid), config, run, loaders, progress, states)
 
     return app
 

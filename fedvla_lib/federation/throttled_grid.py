@@ -1,22 +1,25 @@
-"""A Flower grid that has few messages in flight, for Flower's simulation runtime."""
+"""A Flower grid that sends a few messages at a time and looks for replies often, for Flower's two runtimes."""
 
+import sys
 import time
 from collections.abc import Iterable
 from typing import Any
 
 from flwr.app import Message
 from flwr.serverapp import Grid
-from flwr.superlink.grid import InMemoryGrid
+from flwr.superlink.grid import HttpGrid, InMemoryGrid
 
 # For each client the simulation runtime scans all messages that it holds: n * n for n clients, which with 1,000 clients
 # takes longer than their work.
 MESSAGES_AT_ONCE = 16  # enough to keep every worker of a machine busy
-PULL_INTERVAL_S = 0.1  # Flower's own
+PULL_INTERVAL_S = 0.1  # as Flower in a simulation; in a deployment it would wait for 3 s
 
 
-def for_simulation(grid: Grid) -> "Grid | ThrottledGrid":
-    """Return `grid`, throttled if it is that of Flower's simulation runtime."""
-    return ThrottledGrid(grid, MESSAGES_AT_ONCE) if isinstance(grid, InMemoryGrid) else grid
+def for_runtime(grid: Grid) -> "Grid | ThrottledGrid":
+    """Return `grid`; throttled if it is that of Flower's simulation runtime, unlimited if that of a deployment."""
+    limits = {InMemoryGrid: MESSAGES_AT_ONCE, HttpGrid: sys.maxsize}
+    limit = next((limit for kind, limit in limits.items() if isinstance(grid, kind)), None)
+    return ThrottledGrid(grid, limit) if limit else grid
 
 
 class ThrottledGrid:
