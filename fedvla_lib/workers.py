@@ -5,6 +5,7 @@ The results are those of one process, bit for bit: a piece of work depends on it
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -21,6 +22,7 @@ from fedvla_lib.config import granted_cores
 
 GIB_A_JOB = 2.0  # memory of a process that trains or evaluates at nano size
 HEAVY = ("lerobot.policies.smolvla",)  # takes seconds to import; not MuJoCo, whose display must not be shared
+GRACE_S = 5.0  # to clean up, after its parent was killed
 TERMINATED = 143  # exit status after SIGTERM, as shells report it
 
 
@@ -55,16 +57,23 @@ def side_by_side(
     order = TopologicalSorter({item: set((after or {}).get(item, ())) & set(items) for item in items})
     order.prepare()
     jobs, ready, running = min(jobs, len(items)), [], {}
+    # Pickled here: PyTorch would put a policy's arrays into shared memory, which goes wrong between two forks.
+    work = pickle.dumps(function) if jobs > 1 else b""
     with processes(jobs, preload) if jobs > 1 else nullcontext() as pool:
         while order.is_active():
             ready = sorted([*ready, *order.get_ready()], key=items.index)
             while ready and len(running) < max(1, jobs):
                 item = ready.pop(0)
-                running[pool.submit(function, item) if pool else _here(function, item)] = item
+                running[pool.submit(_unpickled, work, item) if pool else _here(function, item)] = item
             for done in wait(running, return_when=FIRST_COMPLETED).done:
                 item = running.pop(done)
                 yield item, done.result()
                 order.done(item)
+
+
+def _unpickled(function: bytes, item: Any) -> Any:
+    """Call a pickled function in a worker process."""
+    return pickle.loads(function)(item)
 
 
 def _here(function: Callable[[Any], Any], item: Any) -> Future:
@@ -118,3 +127,5 @@ def _end_with(parent: int) -> None:
     while psutil.pid_exists(parent):
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os._exit(TERMINATED)  # it cleaned up, and waits for more work

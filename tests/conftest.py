@@ -8,6 +8,7 @@ import time
 
 # Before the first import of torch, MuJoCo or the hub's client: each reads its variables once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("FEDVLA_JOBS", "1")  # tests run side by side already
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")
 os.environ.setdefault("FLWR_DISABLE_UPDATE_CHECK", "1")

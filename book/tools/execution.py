@@ -210,7 +210,8 @@ def execute_chapters(
     first = sorted(changed, key=lambda path: not any(path in others for others in needed.values()))
     work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs)
     order = first if jobs > 1 else changed[::-1]
-    for path, chapters[path] in side_by_side(work, order, jobs, after=needed, preload=()):
+    for path, chapter in side_by_side(work, order, jobs, after=needed, preload=()):
+        chapters[path] = chapter
         print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
 

@@ -123,11 +123,12 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
 
 def run(options: argparse.Namespace) -> None:
     """Run a federation and print the measurements of the global model by round."""
-    if options.engine == "inline":
-        from fedvla_lib.engines.inline import run_inline as run_federation
-    else:
-        from fedvla_lib.engines.simulation import run_simulation as run_federation
-    _print_rounds(run_federation(_new_or_resumed(options)))
+    from fedvla_lib.engines import inline, simulation
+
+    config = _new_or_resumed(options)
+    if options.engine == "simulation":
+        return _print_rounds(simulation.run_simulation(config))
+    _print_rounds(inline.run_inline(config, jobs=_jobs(options)))
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
@@ -210,9 +211,10 @@ def experiment(options: argparse.Namespace) -> None:
 def _jobs(options: argparse.Namespace) -> int:
     from fedvla_lib.workers import default_jobs
 
-    if options.jobs is not None and options.jobs < 1:
-        raise ValueError(f"--jobs={options.jobs} is not usable: give a whole number from 1")
-    return options.jobs or default_jobs()
+    if options.jobs is None:
+        return default_jobs()
+    _require_positive("--jobs", options.jobs)
+    return options.jobs
 
 
 def search(options: argparse.Namespace) -> None:
@@ -245,7 +247,8 @@ def evaluate(options: argparse.Namespace) -> None:
     chosen = _saved_settings(options.policy)
     actor = PolicyActor(load_policy(chosen), options.seed)
     seeds, videos = rollout_seeds(options.rollouts), options.out and options.out / "videos"
-    rows = pd.DataFrame(roll_out(actor, tasks, seeds, image_size=chosen.image_size, videos_dir=videos))
+    options_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options)}
+    rows = pd.DataFrame(roll_out(actor, tasks, seeds, **options_of))
     if options.out:
         write_atomically(options.out / "rows.csv", rows.to_csv(index=False).encode())
     _print_table(success_table(rows, ["task"]))

@@ -102,6 +102,7 @@ def _add_run(subparsers: Any) -> None:
     parser = _command(subparsers, commands.run, "run federated training with simulated clients", kept)
     text = "inline: one client after the other, in this process; simulation: Flower's simulation, in several processes"
     parser.add_argument("--engine", choices=("inline", "simulation"), default="inline", help=text)
+    _add_jobs(parser, "inline: clients")
     _add_resume(parser)
     _add_settings(parser)
 
@@ -144,6 +145,7 @@ def _add_evaluate(subparsers: Any) -> None:
     parser.add_argument("--rollouts", type=int, default=20, metavar="N", help="rollouts per task (default: 20)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="the folder for videos and rows.csv (default: none)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the policy's noise (default: 0)")
+    _add_jobs(parser, "groups of rollouts")
 
 
 def _add_experiment(subparsers: Any) -> None:

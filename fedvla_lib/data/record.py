@@ -8,6 +8,7 @@ episode. Episode i has its own files and seeds, so its content does not depend o
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,12 @@ from fedvla_lib.robot.labs import labs
 from fedvla_lib.robot.rollout import Episode, run_episode
 from fedvla_lib.robot.sim import So100Env
 from fedvla_lib.robot.spec import CAMERAS, FPS
+from fedvla_lib.robot.stage import Stage, stage_of_process
 from fedvla_lib.robot.tasks import check_tasks
+from fedvla_lib.workers import default_jobs, side_by_side
 
 OLD_DEFAULTS = {"num_labs": 1, "jitter": 0.0}  # settings that older recordings do not state
+WORTH_WORKERS = 30  # episodes: fewer are recorded before workers have started
 MAX_ATTEMPTS = 20  # seeds tried per episode until the expert succeeds
 
 
@@ -43,7 +47,8 @@ def record(
 
     Episode i shows ``tasks[i % len(tasks)]`` in lab ``(i // len(tasks)) % num_labs`` (`robot.labs.labs`). Existing
     episodes are kept: the same call continues an interrupted recording and does nothing on a complete one; a larger
-    `episodes_per_task` extends it.
+    `episodes_per_task` extends it. Many episodes are demonstrated side by side (`workers.default_jobs`), and written in
+    their order; the bytes do not depend on it.
 
     Args:
         tasks: names from `robot.tasks.ALL_TASKS`, in the order in which they alternate.
@@ -66,7 +71,7 @@ def record(
     root.mkdir(parents=True, exist_ok=True)
     with FileLock(root / LOCK):
         _check_folder(root, settings)  # the previous holder of the lock may have recorded something else
-        _record_missing(root, settings, total, progress)
+        _record_missing(root, settings, range(_num_recorded(root), total), progress)
     return root
 
 
@@ -127,22 +132,22 @@ def _num_recorded(root: Path) -> int:
     return json.loads(path.read_text())["total_episodes"] if path.exists() else 0
 
 
-def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: bool) -> None:
-    """Record the episodes that are missing in `root`."""
+def _record_missing(root: Path, settings: dict[str, Any], missing: range, progress: bool) -> None:
+    """Record the episodes that are missing in `root`, in their order."""
     write_json(root / SETTINGS_FILE, settings)
-    done = _num_recorded(root)
-    size, jitter = settings["image_size"], settings["jitter"]
-    envs = {task: So100Env(task, size, jitter=jitter) for task in dict.fromkeys(settings["tasks"])}
-    all_labs = labs(settings["num_labs"])
+    done, total = missing.start, missing.stop
     bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
-    recorder = EpisodeWriter(root, settings, done)
+    recorder, waiting = EpisodeWriter(root, settings, done), {}
+    jobs = default_jobs() if len(missing) >= WORTH_WORKERS else 1
+    stage = Stage(settings["image_size"], settings["jitter"])
+    demonstrate_one = partial(_demonstrated, settings, None if jobs > 1 else stage)
     try:
-        for index in range(done, total):
-            cycle, task_index = divmod(index, len(settings["tasks"]))
-            env, lab = envs[settings["tasks"][task_index]], cycle % len(all_labs)
-            env.lab = all_labs[lab]
-            recorder.add(demonstrate(env, index, settings["seed"]), lab)
-            bar.update()
+        for index, episode in side_by_side(demonstrate_one, missing, jobs):
+            waiting[index] = episode
+            while done in waiting:
+                recorder.add(*waiting.pop(done))
+                bar.update()
+                done += 1
     except KeyboardInterrupt:
         print(f"interrupted: {_num_recorded(root)} of {total} episodes are in {root}, "
               "run the same command to continue", file=sys.stderr)  # fmt: skip
@@ -150,5 +155,15 @@ def _record_missing(root: Path, settings: dict[str, Any], total: int, progress: 
     finally:
         bar.close()
         recorder.close()
-        for env in envs.values():
-            env.close()
+        stage.close()
+
+
+def _demonstrated(settings: dict[str, Any], stage: Stage | None, index: int) -> tuple[Episode, int]:
+    """Return an episode of a recording, and the number of the lab that it shows."""
+    cycle, task_index = divmod(index, len(settings["tasks"]))
+    all_labs = labs(settings["num_labs"])
+    stage = stage or stage_of_process(settings["image_size"], settings["jitter"])
+    (env,) = stage.envs(settings["tasks"][task_index])
+    lab = cycle % len(all_labs)
+    env.lab = all_labs[lab]
+    return demonstrate(env, index, settings["seed"]), lab

@@ -51,7 +51,8 @@ def run_inline(
         data: a data set for each client; empty: each client uses its partition of ``config.data``.
         progress: show a progress bar over the clients of each round.
         raise_errors: re-raise a client's exception (for debugging) instead of rejecting its reply.
-        jobs: clients of a round that work at a time, each in a process with this library's ClientApp.
+        jobs: clients of a round, and groups of rollouts of the global model, that are run at a time, each in its own
+            process with this library's ClientApp.
 
     Raises:
         TooFewReplies: a round had fewer valid replies than `config.min_replies`; the run folder is kept.
@@ -67,7 +68,7 @@ def run_inline(
     with _quiet_flower(), processes(jobs) if jobs > 1 else nullcontext() as pool:
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
         grid.pool = pool
-        server_app.build(loaders, engine="inline", progress=progress, states=grid)(grid, context)
+        server_app.build(loaders, engine="inline", progress=progress, states=grid, jobs=jobs)(grid, context)
     return Path(context.state["run"]["folder"])
 
 

@@ -49,16 +49,18 @@ def measure(
     seeds: Sequence[int] = (),
     videos_dir: Path | None = None,
     progress: bool = False,
+    jobs: int = 1,
 ) -> Measurement:
     """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task and seed.
 
     Args:
         episode_ids: None takes all held-out episodes.
         videos_dir: folder for videos of the rollouts; None records none.
+        jobs: processes that roll out at a time.
     """
     ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
     frames = held_out_frames(bundle, store, ids, config)
-    rows = roll_out(bundle, config, seeds, videos_dir, progress) if len(seeds) else []
+    rows = roll_out(bundle, config, seeds, videos_dir, progress, jobs) if len(seeds) else []
     return Measurement(by_episode(frames, store, ids), average(frames) if frames else {}, rows)
 
 

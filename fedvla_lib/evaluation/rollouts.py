@@ -1,8 +1,10 @@
 """Closed-loop evaluation: one row per rollout, optionally with video and trajectory on disk."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from copy import copy
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.rollout import Episode, act_in_turn, run_episodes
-from fedvla_lib.robot.sim import So100Env
 from fedvla_lib.robot.spec import CAMERAS, Actor
+from fedvla_lib.robot.stage import Stage, stage_of_process
+from fedvla_lib.workers import side_by_side
 
 AT_ONCE = 16  # rollouts that share one batch of policy inference
 FIRST_SEED = 1_000_000  # far from the seeds of recorded demonstrations
@@ -35,8 +38,8 @@ def evaluate(
     image_size: int,
     labs: Sequence[Lab] = (REFERENCE,),
     videos_dir: Path | None = None,
-    num_videos: int | None = None,
     progress: bool = True,
+    jobs: int = 1,
 ) -> list[dict[str, Any]]:
     """Run one rollout per task and seed, seed s in lab s mod len(labs), and return a row for each.
 
@@ -44,44 +47,53 @@ def evaluate(
 
     Args:
         videos_dir: folder for ``rollout_<timestamp>_<task>_<seed>.mp4`` and the trajectory (npz) of each rollout.
-        num_videos: record only the first so many rollouts of each task on video; None records all.
+        jobs: groups of rollouts that run at a time, each in its own process; the rows do not depend on it.
 
     Returns:
         Rows: task, instruction, seed, lab (its name), success (bool), steps, completion_time_s (NaN for failures),
         action_smoothness (see `smoothness`) and video (path or None).
     """
-    with_video = set(seeds[:num_videos] if videos_dir else ())
-    rows = []
-    bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
-    with bar, closing(So100Env(image_size=image_size)) as drawing:
-        for task in tasks:
-            first = So100Env(task, image_size, renderer_of=drawing)
-            for episode in _episodes(actor, first, seeds, labs, with_video, bar):
-                video = save_rollout(episode, Path(videos_dir)) if episode.images else None
-                lab = _lab(labs, episode.seed).name
-                rows.append(row(episode) | {"lab": lab, "video": str(video) if video else None})
-    return rows
+    setting, found = Setting(image_size, tuple(labs), videos_dir), {}
+    groups = [(task, tuple(seeds[i : i + AT_ONCE])) for task in tasks for i in range(0, len(seeds), AT_ONCE)]
+    with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar, closing(Stage(image_size)) as stage:
+        work = partial(_group, actor, setting) if jobs > 1 else partial(_group, actor, setting, stage=stage)
+        for group, rows in side_by_side(work, groups, jobs):
+            found[group] = rows
+            bar.update(len(group[1]))
+    return [row for group in groups for row in found[group]]
 
 
-def _episodes(
-    actor: Actor, first: So100Env, seeds: Sequence[int], labs: Sequence[Lab], with_video: set[int], bar: tqdm
-) -> Iterator[Episode]:
-    """Yield an episode for each seed; an actor with `act_together` drives up to `AT_ONCE` environments in one batch."""
+@dataclass(frozen=True)
+class Setting:
+    """What the rollouts of an evaluation share."""
+
+    image_size: int
+    labs: tuple[Lab, ...]
+    videos_dir: Path | None
+
+
+def _group(
+    actor: Actor, setting: Setting, group: tuple[str, tuple[int, ...]], stage: Stage | None = None
+) -> list[dict[str, Any]]:
+    """Run rollouts of one task; an actor with `act_together` drives them all in one batch."""
+    task, seeds = group
     together = getattr(actor, "act_together", act_in_turn)
-    size = min(len(seeds), 1 if together is act_in_turn else AT_ONCE)
-    envs = [first, *(So100Env(first.task, first.image_size, renderer_of=first) for _ in range(1, size))]
-    for start in range(0, len(seeds), max(1, size)):
-        group = seeds[start : start + size]
-        for env, seed in zip(envs, group, strict=False):
-            env.lab = _lab(labs, seed)
-            env.cameras = CAMERAS if seed in with_video else ()  # none: render only what the actor observes
-        actors = [actor] if size == 1 else [copy(actor) for _ in group]
-        yield from run_episodes(envs[: len(group)], actors, group, together)
-        bar.update(len(group))
+    envs = (stage or stage_of_process(setting.image_size)).envs(task, len(seeds))
+    for env, seed in zip(envs, seeds, strict=True):
+        env.lab = setting.labs[seed % len(setting.labs)]  # a seed is the same scene whatever other seeds are run
+        env.cameras = CAMERAS if setting.videos_dir else ()  # none: render only what the actor observes
+    at_once = len(seeds) if together is not act_in_turn else 1
+    episodes = []
+    for i in range(0, len(seeds), at_once):
+        actors = [actor] if at_once == 1 else [copy(actor) for _ in seeds]
+        episodes += run_episodes(envs[i : i + at_once], actors, seeds[i : i + at_once], together)
+    labs = [env.lab.name for env in envs]
+    return [_row(episode, lab, setting.videos_dir) for episode, lab in zip(episodes, labs, strict=True)]
 
 
-def _lab(labs: Sequence[Lab], seed: int) -> Lab:
-    return labs[seed % len(labs)]  # by seed, so that a seed is the same scene whatever other seeds are run
+def _row(episode: Episode, lab: str, videos_dir: Path | None) -> dict[str, Any]:
+    video = save_rollout(episode, Path(videos_dir)) if videos_dir else None
+    return row(episode) | {"lab": lab, "video": str(video) if video else None}
 
 
 def row(episode: Episode) -> dict[str, Any]:
@@ -109,10 +121,11 @@ def success_rate(rows: Sequence[dict[str, Any]]) -> float:
 
 
 def roll_out(
-    bundle: Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False
-) -> list[dict[str, Any]]:
+    bundle: Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False,
+    jobs: int = 1,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Evaluate one model in closed loop on all tasks of the run, in its labs; the rows are those of `evaluate`."""
     return evaluate(
         PolicyActor(bundle, config.seed), task_names(config), seeds, image_size=config.image_size,
-        labs=labs(config.num_labs), videos_dir=videos_dir, progress=progress,
+        labs=labs(config.num_labs), videos_dir=videos_dir, progress=progress, jobs=jobs,
     )  # fmt: skip

@@ -47,6 +47,7 @@ def build(
     engine: str = "flower",
     progress: bool = False,
     states: ClientStates | None = None,
+    jobs: int = 1,
 ) -> ServerApp:
     """Return the ServerApp.
 
@@ -54,6 +55,7 @@ def build(
         engine: name for the stamp.
         progress: show progress bars for rollouts.
         states: gives access to client states; without it, only runs whose clients keep no state can be resumed.
+        jobs: processes that roll the global model out at a time.
     """
     app = ServerApp()
 
@@ -62,14 +64,15 @@ def build(
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(for_runtime(grid), config, run, loaders, progress, states)
+            federate(for_runtime(grid), config, run, loaders, progress, states, jobs)
 
     return app
 
 
 def federate(
-    grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, states: ClientStates | None = None
-) -> None:
+    grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, states: ClientStates | None = None,
+    jobs: int = 1,
+) -> None:  # fmt: skip
     """Run or resume a federation on `grid` and write it to `run`.
 
     Raises:
@@ -91,7 +94,7 @@ def federate(
     )  # fmt: skip
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
-    evaluator = GlobalEvaluator(config, store, bundle, run, progress)
+    evaluator = GlobalEvaluator(config, store, bundle, run, progress, jobs)
     packed = normalisation.pack_stats(stats)
     strategy.start(
         grid,
@@ -153,6 +156,7 @@ class GlobalEvaluator:
     bundle: model.Bundle
     run: RunFolder
     progress: bool
+    jobs: int
 
     def __call__(self, round_number: int, arrays: ArrayRecord) -> MetricRecord:
         """Save ``global_model/round_N``, measure it and log the result; round 0 is the model before training."""
@@ -164,7 +168,7 @@ class GlobalEvaluator:
         due = measure.rolls_out(self.config, round_number)
         found = measure.measure(
             self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
-            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress,
+            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress, jobs=self.jobs,
         )  # fmt: skip
         measure.log_measurement(self.run, round_number, GLOBAL, found)
         values = found.averages | found.success() | found.success_by_task(task_names(self.config))
