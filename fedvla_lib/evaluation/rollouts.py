@@ -55,7 +55,8 @@ def evaluate(
     """
     setting, found = Setting(image_size, tuple(labs), videos_dir), {}
     groups = [(task, tuple(seeds[i : i + AT_ONCE])) for task in tasks for i in range(0, len(seeds), AT_ONCE)]
-    with tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress) as bar, closing(Stage(image_size)) as stage:
+    bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
+    with bar, closing(Stage(image_size)) as stage:
         work = partial(_group, actor, setting) if jobs > 1 else partial(_group, actor, setting, stage=stage)
         for group, rows in side_by_side(work, groups, jobs):
             found[group] = rows
