@@ -59,7 +59,8 @@ def test_rollouts_of_an_evaluation(store, tmp_path):
     tables = []
     for jobs in (1, 2):
         seeds, options = rollouts.rollout_seeds(rollouts.AT_ONCE + 2), {"image_size": 64, "progress": False}
-        tables.append(pd.DataFrame(rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds, jobs=jobs, **options)))
+        found = rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds, jobs=jobs, **options)
+        tables.append(pd.DataFrame(found))
     pd.testing.assert_frame_equal(*tables)
     videos = rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds[:2], videos_dir=tmp_path, jobs=2, **options)
     assert all(Path(row["video"]).is_file() for row in videos)
@@ -101,7 +102,7 @@ def test_cells_of_an_experiment(recording, tmp_path, monkeypatch):
     (tmp_path / "plan.toml").write_text(PLAN.format(data=str(recording)))
     plan, tables, lines = read_plan(tmp_path / "plan.toml"), [], []
     for jobs in (1, 2):
-        monkeypatch.setenv("FEDVLA_CACHE", str(tmp_path / f"cache-{jobs}"))  # else the second would find the first's runs
+        monkeypatch.setenv("FEDVLA_CACHE", str(tmp_path / f"cache-{jobs}"))  # not the first's
         experiment.run_plan(plan, tmp_path / str(jobs), say=lines.append, jobs=jobs)
         found = results.read_results(tmp_path / str(jobs))
         tables.append(found.sort_values(list(found.columns[:6])).reset_index(drop=True))

@@ -89,7 +89,9 @@ def held_out_frames(
     return measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
 
 
-def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]) -> list[dict[str, float]]:
+def by_episode(
+    frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]
+) -> list[dict[str, float]]:
     """Return the averages of `held_out_frames` for each episode, with episode_id and num_examples."""
     counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
     ends = np.cumsum(counts)
