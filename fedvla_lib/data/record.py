@@ -47,8 +47,7 @@ def record(
 
     Episode i shows ``tasks[i % len(tasks)]`` in lab ``(i // len(tasks)) % num_labs`` (`robot.labs.labs`). Existing
     episodes are kept: the same call continues an interrupted recording and does nothing on a complete one; a larger
-    `episodes_per_task` extends it. Many episodes are demonstrated side by side (`workers.default_jobs`), and written in
-    their order; the bytes do not depend on it.
+    `episodes_per_task` extends it. Many are demonstrated side by side (`workers.default_jobs`), with the same bytes.
 
     Args:
         tasks: names from `robot.tasks.ALL_TASKS`, in the order in which they alternate.
