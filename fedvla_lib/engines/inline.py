@@ -5,7 +5,6 @@ run the same app with `simulation` or `deployment`.
 """
 
 import copy
-import functools
 import logging
 import time
 import traceback
@@ -22,8 +21,8 @@ from flwr.supercore.task_identity import TaskIdentity
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, check, to_run_config
-from fedvla_lib.data.normalisation import pack_stats, unpack_stats
 from fedvla_lib.federation import client, client_app, server_app
+from fedvla_lib.federation.client import cached
 from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
 from fedvla_lib.policy.parameters import Arrays
 
@@ -61,14 +60,6 @@ def run_inline(
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
         server_app.build(loaders, engine="inline", progress=progress, states=grid)(grid, context)
     return Path(context.state["run"]["folder"])
-
-
-def cached(loaders: client.Loaders) -> client.Loaders:
-    """Return loaders that open the frames and build the policy once and share them between the clients of a run."""
-    # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
-    build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
-    frames = functools.cache(loaders.open_frames)
-    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)))
 
 
 class InlineGrid(Grid):
