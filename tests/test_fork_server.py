@@ -88,7 +88,9 @@ def test_a_fork_and_its_children_end_with_the_call_also_when_the_server_is_gone(
     process = call("wait")
     pids = [json.loads(process.stdout.readline())[3], int(process.stdout.readline())]
     server.kill()
-    time.sleep(0.2)
+    server.wait()
+    other = call()  # does not wait for a server that is no more
+    assert json.loads(other.communicate("\n", timeout=30)[0])[3] == other.pid
     assert not any(gone(pid, 0) for pid in pids)
     process.kill()
     assert all(gone(pid) for pid in pids)

@@ -49,6 +49,7 @@ def serve(modules: list[str]) -> list[str]:
     jemalloc start a thread at import, and are prepared for forks.
     """
     listener = socket.socket(fileno=os.dup(0))
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a fork that kept the socket would let calls wait for a dead server
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks need not be waited for
     gc.disable()  # a fifth of the time would be collections
     for module in modules:
