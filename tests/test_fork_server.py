@@ -29,20 +29,20 @@ sys.exit(input())
 @pytest.fixture
 def calls(tmp_path, monkeypatch):
     """A function that calls a script, through a fork server that has loaded one small module; and the server."""
-    monkeypatch.setattr(warm_start, "SERVERS", {("python",): ("tabnanny",)})
+    monkeypatch.setattr(warm_start, "SERVERS", {(warm_start.PYTHON,): ("tabnanny",)})
     (tmp_path / "its script.py").write_text(SCRIPT)
     plain = superlink.flower_environment(tmp_path)
     with warm_start.warm_start(plain, tmp_path / "log") as environment:
         (server,) = [one for one in psutil.Process().children() if str(warm_start.FORK_SERVER) in one.cmdline()]
 
         def call(*arguments):
-            command = [stand_in(environment, "python"), str(tmp_path / "its script.py"), *arguments]
+            command = [stand_in(environment, warm_start.PYTHON), str(tmp_path / "its script.py"), *arguments]
             piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": tmp_path}
             return subprocess.Popen(command, env={**environment, "COLOUR": "blue"}, **piped)
 
         yield call, server
     assert not server.is_running() or server.status() == psutil.STATUS_ZOMBIE
-    assert not list(Path(stand_in(environment, "python")).parent.glob("*"))
+    assert not list(Path(stand_in(environment, warm_start.PYTHON)).parent.glob("*"))
 
 
 def stand_in(environment, name):
@@ -88,7 +88,9 @@ def test_a_fork_and_its_children_end_with_the_call_also_when_the_server_is_gone(
     process = call("wait")
     pids = [json.loads(process.stdout.readline())[3], int(process.stdout.readline())]
     server.kill()
-    time.sleep(0.2)
+    server.wait()
+    other = call()  # does not wait for a server that is no more
+    assert json.loads(other.communicate("\n", timeout=30)[0])[3] == other.pid
     assert not any(gone(pid, 0) for pid in pids)
     process.kill()
     assert all(gone(pid) for pid in pids)
@@ -101,10 +103,10 @@ def test_a_fork_that_is_killed_is_reported_as_a_shell_would(calls):
 
 
 def test_nothing_is_left_of_the_forks_when_the_servers_are_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(warm_start, "SERVERS", {("python",): ()})
+    monkeypatch.setattr(warm_start, "SERVERS", {(warm_start.PYTHON,): ()})
     (tmp_path / "script.py").write_text("import os, time; print(os.getpid(), flush=True); time.sleep(60)")
     with warm_start.warm_start(superlink.flower_environment(tmp_path), tmp_path / "log") as environment:
-        command = [stand_in(environment, "python"), str(tmp_path / "script.py")]
+        command = [stand_in(environment, warm_start.PYTHON), str(tmp_path / "script.py")]
         process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         pid = int(process.stdout.readline())
     assert gone(pid) and process.wait(10)
@@ -131,7 +133,7 @@ def test_the_servers_load_pytorch_but_not_this_library_and_are_safe_to_fork(tmp_
         "print(ours, loaded, threading.active_count(), torch.cuda._is_in_bad_fork())"
     )
     with warm_start.warm_start(superlink.flower_environment(tmp_path), tmp_path / "log") as environment:
-        command = [stand_in(environment, "python"), str(tmp_path / "script.py")]
+        command = [stand_in(environment, warm_start.PYTHON), str(tmp_path / "script.py")]
         said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
         assert said == "[] True 1 False\n"
-        assert set(os.listdir(Path(command[0]).parent)) >= {"flwr", "flwr-clientapp", "flower-superexec", "python"}
+        assert set(os.listdir(Path(command[0]).parent)) >= {"flwr", "flwr-clientapp", "flower-superexec"}

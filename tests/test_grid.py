@@ -8,7 +8,7 @@ from flwr.clientapp import ClientApp
 from flwr.server.superlink.linkstate import LinkStateFactory
 from flwr.supercore.object_store import ObjectStoreFactory
 from flwr.superlink.federation import NoOpFederationManager
-from flwr.superlink.grid import InMemoryGrid
+from flwr.superlink.grid import HttpGrid, InMemoryGrid
 
 from fedvla_lib.config import from_profile, to_run_config
 from fedvla_lib.engines.inline import RUN_ID, InlineGrid, claim_identity
@@ -66,6 +66,8 @@ def in_memory(kind=InMemoryGrid) -> InMemoryGrid:
 def test_only_the_grid_of_the_simulation_is_limited():
     assert isinstance(for_runtime(in_memory()), ThrottledGrid)
     assert for_runtime(inline := grid_of()) is inline
+    deployed = for_runtime(HttpGrid("127.0.0.1:1", insecure=True, token="none"))
+    assert deployed._limit > 1e6 and deployed._interval_s < 1  # Flower's own grid would look every three seconds
 
 
 class Asked(InMemoryGrid):

@@ -45,9 +45,11 @@ def call(address: str, command: list[str]) -> int:
 def serve(modules: list[str]) -> list[str]:
     """Serve calls until killed; return, only in a fork, the command that it is to run.
 
-    The server only imports: a fork of a process with threads, or that has used a GPU, is not safe.
+    The server only imports, since a fork of a process that runs threads or has used a GPU is not safe. OpenBLAS and
+    jemalloc start a thread at import, and are prepared for forks.
     """
     listener = socket.socket(fileno=os.dup(0))
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a fork that kept the socket would let calls wait for a dead server
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks need not be waited for
     gc.disable()  # a fifth of the time would be collections
     for module in modules:

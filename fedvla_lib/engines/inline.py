@@ -5,7 +5,6 @@ a time in worker processes, with the same result. To scale up, run the same app 
 """
 
 import copy
-import functools
 import itertools
 import logging
 import time
@@ -24,8 +23,8 @@ from flwr.supercore.task_identity import TaskIdentity
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config, check, to_run_config
-from fedvla_lib.data.normalisation import pack_stats, unpack_stats
 from fedvla_lib.federation import client, client_app, server_app
+from fedvla_lib.federation.client import cached
 from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
 from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.workers import processes
@@ -70,15 +69,6 @@ def run_inline(
         grid.pool = pool
         server_app.build(loaders, engine="inline", progress=progress, states=grid, jobs=jobs)(grid, context)
     return Path(context.state["run"]["folder"])
-
-
-def cached(loaders: client.Loaders) -> client.Loaders:
-    """Return loaders that open and divide the frames and build the policy once, for all clients of a run."""
-    # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
-    build = functools.cache(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
-    frames = functools.cache(loaders.open_frames)
-    shares = functools.cache(loaders.shares)
-    return client.Loaders(frames, lambda config, stats: build(config, pack_stats(stats)), shares)
 
 
 class InlineGrid(Grid):
@@ -198,15 +188,10 @@ def _handle(app: ClientApp, message: Message, context: Context, raise_errors: bo
     return reply, context, time.perf_counter() - began
 
 
-@functools.cache
-def _app_of_process() -> ClientApp:
-    """The ClientApp of a worker process, which handles messages of many clients and loads frames and policy once."""
-    claim_identity()
-    return client_app.build(cached(client.LOADERS))
-
-
 def _in_worker(message: Message, context: Context) -> tuple[Message, Context, float]:
-    return _handle(_app_of_process(), message, context, raise_errors=False)
+    """Handle a message in a worker process, whose app keeps frames and policy between messages."""
+    claim_identity()
+    return _handle(client_app.app, message, context, raise_errors=False)
 
 
 def claim_identity() -> None:

@@ -30,7 +30,7 @@ OFFLINE = {  # no telemetry or update checks
     "FLWR_DISABLE_RUNTIME_DEPENDENCY_INSTALLATION": "1",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
-PROMPT = {"FLWR_SUPEREXEC_TASK_POLL_INTERVAL": "0.1"}  # seconds until Flower sees that a process is to be started
+PROMPT = {"FLWR_SUPEREXEC_TASK_POLL_INTERVAL": "0.25"}  # seconds until Flower sees that a process is to be started
 CONNECTION = "book"
 
 

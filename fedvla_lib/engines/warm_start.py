@@ -25,7 +25,7 @@ FLOWER = ("flwr.cli.app", "flwr.supercore.cli", "flwr.superlink.cli", "flwr.supe
 APP = ("lerobot.policies.smolvla", "lerobot.datasets", "flwr.serverapp.strategy")
 SERVERS = {
     ("flwr", "flower-superexec"): FLOWER,
-    ("flwr-clientapp", "flwr-serverapp", "flwr-simulation", "python"): FLOWER + APP,
+    ("flwr-clientapp", "flwr-serverapp", "flwr-simulation", PYTHON := "python-of-ray"): FLOWER + APP,
 }
 LONGEST_FOLDER = 98  # bytes: the path of a Unix socket may have 107
 
@@ -46,7 +46,7 @@ def warm_start(environment: dict[str, str], log: Path) -> Iterator[dict[str, str
             running.callback(processes.stop, server)
             _write_stand_ins(Path(folder), programs, address)
         path = os.pathsep.join([folder, environment["PATH"]])
-        yield {**environment, **ray_python(os.path.join(folder, "python")), "PATH": path}
+        yield {**environment, **ray_python(os.path.join(folder, PYTHON)), "PATH": path}
 
 
 def ray_python(python: str) -> dict[str, str]:
@@ -67,6 +67,6 @@ def _write_stand_ins(folder: Path, programs: Sequence[str], address: str) -> Non
     """Write a script for each program that has a fork server run it."""
     call = [sys.executable, "-IS", str(FORK_SERVER), "call", address]  # without site-packages: faster
     for name in programs:
-        command = shlex.join(call if name == "python" else [*call, processes.program(name)])
+        command = shlex.join(call if name == PYTHON else [*call, processes.program(name)])
         (folder / name).write_text(f'#!/bin/sh\nexec {command} "$@"\n')
         (folder / name).chmod(0o700)

@@ -4,6 +4,7 @@ Data set, split and partition follow from the run's settings, so that all client
 each client uses only its own episodes.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from fedvla_lib.config import Config
 from fedvla_lib.data import frame_store, splits
 from fedvla_lib.data.batches import Batches
-from fedvla_lib.data.normalisation import Stats, episode_stats
+from fedvla_lib.data.normalisation import Stats, episode_stats, pack_stats, unpack_stats
 from fedvla_lib.data.recordings import open_frames
 from fedvla_lib.data.splits import Share, labs_of, num_frames, shares, tasks_of
 from fedvla_lib.evaluation.measure import measure
@@ -30,7 +31,7 @@ CLIENT_SEEDS = 1_000  # rollout seeds reserved for each client
 
 @dataclass(frozen=True)
 class Loaders:
-    """How frames are opened, divided among clients, and a policy is built; the inline engine passes cached functions.
+    """How frames are opened, divided among clients, and a policy is built; the engines pass cached functions.
 
     Clients may share one policy: each overwrites all trainable arrays, and nothing else changes.
     """
@@ -41,6 +42,31 @@ class Loaders:
 
 
 LOADERS = Loaders(open_frames, model.load_policy)
+
+
+def cached(loaders: Loaders, limit: int | None = None) -> Loaders:
+    """Return loaders that open the frames and build the policy once and share them between clients.
+
+    Args:
+        limit: most data sets, and most policies, that stay in memory; None keeps all.
+    """
+    keep = functools.lru_cache(limit)
+    # Statistics hold arrays, which are not hashable; their text form is, and it is exact.
+    build = keep(lambda config, text: loaders.load_policy(config, unpack_stats(text)))
+    frames, shares = keep(loaders.open_frames), keep(loaders.shares)
+    return Loaders(frames, lambda config, stats: build(config, pack_stats(stats)), shares)
+
+
+class WorkerLoaders(Loaders):
+    """Cached loaders of a process. Ray sends the app with every message; these are sent by name, so that they stay."""
+
+    def __reduce__(self) -> str:
+        """Return the name in this module."""
+        return "WORKER_LOADERS"
+
+
+# One policy: with normalisation=own each client has another.
+WORKER_LOADERS = WorkerLoaders(**vars(cached(LOADERS, limit=1)))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import measure
 from fedvla_lib.federation import messages
-from fedvla_lib.federation.client import LOADERS, Client, Loaders, open_client
+from fedvla_lib.federation.client import LOADERS, WORKER_LOADERS, Client, Loaders, open_client
 from fedvla_lib.federation.quantisation import DOWNWARD, with_feedback
 from fedvla_lib.federation.strategies.fedprox import Proximal
 from fedvla_lib.federation.strategies.scaffold import ControlVariates
@@ -177,4 +177,4 @@ def _policy(client: Client, message: Message, loaders: Loaders, context: Context
     return bundle
 
 
-app = build()
+app = build(WORKER_LOADERS)

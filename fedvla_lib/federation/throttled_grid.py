@@ -12,21 +12,25 @@ from flwr.superlink.grid import HttpGrid, InMemoryGrid
 # For each client the simulation runtime scans all messages that it holds: n * n for n clients, which with 1,000 clients
 # takes longer than their work.
 MESSAGES_AT_ONCE = 16  # enough to keep every worker of a machine busy
-PULL_INTERVAL_S = 0.1  # as Flower in a simulation; in a deployment it would wait for 3 s
+PULL_INTERVAL_S = 0.1  # Flower's own in a simulation
+HTTP_INTERVAL_S = 0.25  # in a deployment, where Flower would wait for 3 s; a request takes the SuperLink 15 ms
 
 
 def for_runtime(grid: Grid) -> "Grid | ThrottledGrid":
     """Return `grid`; throttled if it is that of Flower's simulation runtime, unlimited if that of a deployment."""
-    limits = {InMemoryGrid: MESSAGES_AT_ONCE, HttpGrid: sys.maxsize}
-    limit = next((limit for kind, limit in limits.items() if isinstance(grid, kind)), None)
-    return ThrottledGrid(grid, limit) if limit else grid
+    if isinstance(grid, HttpGrid):
+        return ThrottledGrid(grid, sys.maxsize, HTTP_INTERVAL_S)
+    return ThrottledGrid(grid, MESSAGES_AT_ONCE) if isinstance(grid, InMemoryGrid) else grid
 
 
 class ThrottledGrid:
-    """Sends a message only when fewer than `limit` are unanswered; delegates everything else to `grid`."""
+    """Sends a message only when fewer than `limit` are unanswered; delegates everything else to `grid`.
 
-    def __init__(self, grid: Grid, limit: int) -> None:
-        self._grid, self._limit = grid, limit
+    It looks for replies every `interval_s` seconds.
+    """
+
+    def __init__(self, grid: Grid, limit: int, interval_s: float = PULL_INTERVAL_S) -> None:
+        self._grid, self._limit, self._interval_s = grid, limit, interval_s
 
     def __getattr__(self, name: str) -> Any:
         """Delegate to the grid."""
@@ -43,5 +47,5 @@ class ThrottledGrid:
             sent -= {reply.metadata.reply_to_message_id for reply in back}
             replies += back
             if sent and not back:
-                time.sleep(PULL_INTERVAL_S)
+                time.sleep(self._interval_s)
         return replies
