@@ -42,21 +42,22 @@ def main() -> None:
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
     torch.set_num_threads(1)
+    report("rollouts", [compared(chosen, config, jobs) for jobs in sorted({1, granted_cores()})], chosen.out)
+
+
+def compared(chosen: Namespace, config: Config, jobs: int) -> dict[str, Any]:
+    """Measure both sides on `jobs` cores; on several, lerobot-eval has a process for each environment."""
     rows: list[dict] = []
-    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, rollouts.rollout_seeds(chosen.rollouts))))
-    report("rollouts", [compared(chosen, config, rows, ours_s, own) for own in (False, True)], chosen.out)
-
-
-def compared(chosen: Namespace, config: Config, rows: list[dict], ours_s: float, own_processes: bool) -> dict[str, Any]:
-    """Measure lerobot-eval in one mode and compare it with our rows."""
+    own_processes, seeds = jobs > 1, rollouts.rollout_seeds(chosen.rollouts)
+    ours_s = timed(lambda: rows.extend(ours(config, chosen.task, seeds, jobs)))
     with tempfile.TemporaryDirectory() as folder:
         theirs_s, successes = lerobot_eval(chosen, config, Path(folder), own_processes)
     return {
         "lerobot-eval's environments": "a process each" if own_processes else "in its own process",
-        "its cores": granted_cores() if own_processes else 1,
+        "cores": jobs,
         "task": chosen.task,
         "rollouts": chosen.rollouts,
-        "ours, one core [1/min]": 60 * chosen.rollouts / ours_s,
+        "ours [1/min]": 60 * chosen.rollouts / ours_s,
         "lerobot-eval [1/min]": 60 * chosen.rollouts / theirs_s,
         "ratio": theirs_s / ours_s,
         "our successes": sum(row["success"] for row in rows),
@@ -72,19 +73,13 @@ class SameNoise(PolicyActor):
         super().reset(env, FIRST_SEED)
 
 
-def ours(config: Config, task: str, seeds: list[int]) -> list[dict]:
-    """Load the policy and run the rollouts, as `fedvla evaluate` does."""
+def ours(config: Config, task: str, seeds: list[int], jobs: int) -> list[dict]:
+    """Load the policy and run the rollouts, as `fedvla evaluate` does, as many on video as lerobot-eval's."""
     actor = SameNoise(model.load_policy(config))
+    settings = {"image_size": config.image_size, "progress": False, "jobs": jobs}
     with tempfile.TemporaryDirectory() as videos:
-        return rollouts.evaluate(
-            actor,
-            [task],
-            seeds,
-            image_size=config.image_size,
-            videos_dir=Path(videos),
-            num_videos=VIDEOS,
-            progress=False,
-        )
+        rows = rollouts.evaluate(actor, [task], seeds[:VIDEOS], videos_dir=Path(videos), **settings)
+    return rows + rollouts.evaluate(actor, [task], seeds[VIDEOS:], **settings)
 
 
 def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes: bool) -> tuple[float, list[bool]]:
