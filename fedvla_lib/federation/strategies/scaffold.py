@@ -65,7 +65,6 @@ class CheckedScaffold(Checked, FedAvg):
     """
 
     _extra_records = (messages.CONTROL,)
-    _persistent = ("control",)
 
     def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
         super().__init__(**checked)
