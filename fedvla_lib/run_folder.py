@@ -92,11 +92,7 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
 
 @contextmanager
 def hold(root: Path) -> Iterator[None]:
-    """Lock a run folder for writing.
-
-    Raises:
-        ValueError: another process holds the lock.
-    """
+    """Lock a run folder for writing; raise ValueError if another process holds the lock."""
     try:
         lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S).acquire()
     except Timeout as error:
@@ -202,16 +198,12 @@ def _make_folder(out: Path) -> Path:
         except FileExistsError:
             named += timedelta(seconds=1)
         except OSError as error:
-            message = f"cannot make the run folder {path} ({error.strerror}): give a writable folder as out"
-            raise ValueError(message) from error
+            reason = f"cannot make the run folder {path} ({error.strerror})"
+            raise ValueError(f"{reason}: give a writable folder as out") from error
 
 
 def read_events(root: Path) -> list[dict[str, Any]]:
-    """Return the complete events of a run.
-
-    Raises:
-        ValueError: not a run folder, or a line of ``metrics.jsonl`` is not an event.
-    """
+    """Return the complete events of a run; raise ValueError if it is no run folder, or a line is not an event."""
     path = Path(root) / METRICS_FILE
     if not path.is_file():
         raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")

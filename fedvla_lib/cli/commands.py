@@ -123,11 +123,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
-    """Return the settings of a new run, or of the interrupted run to resume.
-
-    Raises:
-        ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
-    """
+    """Return the settings of a new run, or of the interrupted run to resume; ValueError if it cannot be, with these."""
     from fedvla_lib.run_folder import hold, read_config, resumable
 
     if not options.resume:
@@ -288,11 +284,7 @@ def videos(options: argparse.Namespace) -> int:
 
 
 def _saved_settings(folder: Path) -> Config:
-    """Return settings that load the policy saved in `folder` as it was trained.
-
-    Raises:
-        ValueError: not a pretrained_model folder, or a policy without our cameras.
-    """
+    """Return settings that load the policy saved in `folder` as it was trained."""
     if not (file := folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
     saved = json.loads(file.read_text())

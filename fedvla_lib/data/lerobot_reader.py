@@ -78,11 +78,7 @@ class ReadDataset:
 
 
 def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
-    """Read and check everything but the images.
-
-    Raises:
-        DataError: the data set is broken, or is not of an SO-100.
-    """
+    """Read and check everything but the images; raise DataError if it is broken, or not of an SO-100."""
     info = _read_info(root)
     _check_features(root, info)
     files = _read_episodes(root, info)
@@ -220,11 +216,7 @@ def _vectors(episode: str, key: str, column: pd.Series) -> np.ndarray:
 
 
 def read_images(dataset: ReadDataset, key: str) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each frame of one camera once, as (store row, uint8 (H, W, 3)).
-
-    Raises:
-        DataError: a file is missing or damaged.
-    """
+    """Yield each frame of one camera once: store row, uint8 (H, W, 3); raise DataError if a file is damaged or gone."""
     info, starts = dataset.info, dataset.episodes["start"].to_numpy()
     kind, pattern, read = "data", "data_path", _still_images
     if info["features"][key]["dtype"] == "video":

@@ -19,11 +19,7 @@ DISTINCT = 8  # distinct values that the bootstrap of a mean needs
 
 
 def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
-    """Return the metrics.
-
-    Raises:
-        ValueError: one of them is not in `known`.
-    """
+    """Return the metrics; raise ValueError if one of them is not in `known`."""
     for metric in metrics or [""]:  # none is no choice either
         if metric not in known:
             raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(known)}")
@@ -49,6 +45,19 @@ def success_table(rows: pd.DataFrame, by: Sequence[str], confidence: float = CON
     ends = [wilson(int(k), int(n), confidence) for k, n in zip(table.successes, table.n, strict=True)]
     table["low"], table["high"] = zip(*ends, strict=True)
     return table
+
+
+def mean_with_interval(
+    values: np.ndarray, *, of_success: bool, seed: int, confidence: float = CONFIDENCE
+) -> dict[str, float]:
+    """Return n, value (the mean), low and high: `wilson` for outcomes, else `mean_interval`; NaN without values."""
+    if not len(values):
+        return {"n": 0, "value": np.nan, "low": np.nan, "high": np.nan}
+    if of_success:
+        low, high = wilson(int(values.sum()), len(values), confidence)
+    else:
+        low, high = mean_interval(values, seed=seed, confidence=confidence)
+    return {"n": len(values), "value": float(values.mean()), "low": low, "high": high}
 
 
 def success_difference(

@@ -73,13 +73,10 @@ def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.Data
     """Return a metric for each round: n, value, low, high (Wilson for success, else bootstrap over rollouts)."""
     lines = []
     for number, part in rows.groupby("round"):
-        each = part["success" if metric == "success_rate" else metric].dropna().to_numpy(float)
-        value, low, high = float(each.mean()) if len(each) else float("nan"), float("nan"), float("nan")
-        if metric == "success_rate":
-            low, high = statistics.wilson(int(each.sum()), len(each))
-        elif len(each):
-            low, high = statistics.mean_interval(each, seed=seed)
-        lines.append({"round": number, "metric": metric, "n": len(each), "value": value, "low": low, "high": high})
+        is_success = metric == "success_rate"
+        each = part["success" if is_success else metric].dropna().to_numpy(float)
+        measured = statistics.mean_with_interval(each, of_success=is_success, seed=seed)
+        lines.append({"round": number, "metric": metric, **measured})
     return pd.DataFrame(lines)
 
 

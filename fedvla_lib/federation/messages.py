@@ -51,11 +51,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
 
 
 def unpack_arrays(record: ArrayRecord) -> Arrays:
-    """Return the arrays of a record by name.
-
-    Raises:
-        ParameterError: the bytes of an array cannot be decoded.
-    """
+    """Return the arrays of a record by name; raise ParameterError if the bytes of one cannot be decoded."""
     return {name: _decode(name, array) for name, array in record.items()}
 
 

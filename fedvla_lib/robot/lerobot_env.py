@@ -40,17 +40,12 @@ class So100SimConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         check_tasks(self.task_names)
+        action = PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))
+        state = PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,))
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
-        self.features = {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,)),
-            **{f"pixels/{camera}": image for camera in CAMERAS},
-        }
-        self.features_map = {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            **{f"pixels/{camera}": image_key(camera) for camera in CAMERAS},
-        }
+        self.features = {ACTION: action, "agent_pos": state, **{f"pixels/{camera}": image for camera in CAMERAS}}
+        images = {f"pixels/{camera}": image_key(camera) for camera in CAMERAS}
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, **images}
 
     @property
     def task_names(self) -> list[str]:

@@ -184,11 +184,7 @@ def task_of(text: str) -> str:
 
 
 def check_tasks(names: Iterable[str]) -> list[str]:
-    """Return `names` as a list.
-
-    Raises:
-        ValueError: an unknown task; the message lists the valid ones.
-    """
+    """Return `names` as a list; raise ValueError, listing the valid ones, if one is not a task."""
     names = list(names)
     for name in names:
         if name not in ALL_TASKS:
