@@ -88,7 +88,7 @@ def first_stamp(config: Config, engine: str) -> dict[str, Any]:
     return {
         "status": "running", "engine": engine, "started": now(), "wall_s": None, "commit": _commit(),
         "config_hash": config_hash(config), "seed": config.seed, "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
+        "versions": {name: version_of(name) for name in PACKAGES},
         "hardware": {
             "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count(),
             "device": config.device, "memory_gb": round(memory_gib(), 1),
@@ -96,11 +96,12 @@ def first_stamp(config: Config, engine: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Return the version of an installed package; None for this library in a Flower app bundle."""
     try:
         return version(package)
     except PackageNotFoundError:
-        return None  # in a Flower app bundle this library is not installed
+        return None
 
 
 def memory_gib() -> float:
