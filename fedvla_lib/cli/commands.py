@@ -190,17 +190,12 @@ def experiment(options: argparse.Namespace) -> None:
     from fedvla_lib.experiments.experiment import run_plan
     from fedvla_lib.experiments.experiment_file import read_plan
     from fedvla_lib.experiments.results import read_results, summary
-
-    run_plan(read_plan(options.file), options.out, jobs=_jobs(options))
-    print(summary(read_results(options.out)).round(3).to_string(index=False))
-
-
-def _jobs(options: argparse.Namespace) -> int:
     from fedvla_lib.workers import default_jobs
 
     if options.jobs is not None and options.jobs < 1:
         raise ValueError(f"--jobs={options.jobs} is not usable: give a whole number from 1")
-    return options.jobs or default_jobs()
+    run_plan(read_plan(options.file), options.out, jobs=options.jobs or default_jobs())
+    print(summary(read_results(options.out)).round(3).to_string(index=False))
 
 
 def search(options: argparse.Namespace) -> None:

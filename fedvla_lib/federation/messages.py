@@ -52,7 +52,16 @@ def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
 
 def unpack_arrays(record: ArrayRecord) -> Arrays:
     """Return the arrays of a record by name; raise ParameterError if the bytes of one cannot be decoded."""
-    return {name: _decode(name, array) for name, array in record.items()}
+    arrays = {}
+    for name, array in record.items():
+        try:
+            arrays[name] = _numbers(name, array).copy()  # of its own, writable memory
+        except ParameterError:
+            raise
+        # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
+        except Exception as error:
+            raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
+    return arrays
 
 
 def checked_arrays(
@@ -137,17 +146,6 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
 def make_note(**values: Any) -> ConfigRecord:
     """Return the client's note; underscores in keywords become dashes."""
     return ConfigRecord({key.replace("_", "-"): value for key, value in values.items()})
-
-
-def _decode(name: str, array: Array) -> np.ndarray:
-    """Return one array of a record after checking that its bytes are a .npy of numbers of the declared size."""
-    try:
-        return _numbers(name, array).copy()  # of its own, writable memory
-    except ParameterError:
-        raise
-    # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
-    except Exception as error:
-        raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
 
 
 def _numbers(name: str, array: Array) -> np.ndarray:

@@ -83,7 +83,13 @@ def check_arrays(
     if parts := [f"{len(wrong)} {word} (first {min(wrong)!r})" for word, wrong in differences.items() if wrong]:
         raise ParameterError("names", f"{len(reference_shapes)} arrays expected: {' and '.join(parts)}")
     for name, shape in reference_shapes.items():
-        _check_one(name, arrays[name], shape)
+        array = arrays[name]
+        if array.dtype != np.float32:
+            raise ParameterError("dtype", f"array {name!r} has dtype {array.dtype}, expected float32")
+        if array.shape != shape:
+            raise ParameterError("shape", f"array {name!r} has shape {array.shape}, expected {shape}")
+        if bad := int((~np.isfinite(array)).sum()):
+            raise ParameterError("non-finite", f"array {name!r} has {bad} non-finite values")
     if expected_digest is not None:
         check_digest(arrays, expected_digest)
 
@@ -92,13 +98,3 @@ def check_digest(arrays: Mapping[str, np.ndarray], expected_digest: str) -> None
     """Raise ParameterError unless the arrays match the digest sent with them."""
     if (actual := digest(arrays)) != expected_digest:
         raise ParameterError("hash", f"SHA-256 is {actual[:12]}..., expected {expected_digest[:12]}...")
-
-
-def _check_one(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    if array.dtype != np.float32:
-        raise ParameterError("dtype", f"array {name!r} has dtype {array.dtype}, expected float32")
-    if tuple(array.shape) != shape:
-        raise ParameterError("shape", f"array {name!r} has shape {tuple(array.shape)}, expected {shape}")
-    if not np.isfinite(array).all():
-        bad = int(array.size - np.isfinite(array).sum())
-        raise ParameterError("non-finite", f"array {name!r} has {bad} non-finite values")

@@ -179,7 +179,9 @@ class Checked:
                 self._reject(server_round, self.roster.name(node), kind, error)
             else:
                 valid.append(by_node[node])
-                self.report(server_round, self.roster.name(node), kind, _values(by_node[node]))
+                values = by_node[node].content.metric_records[messages.METRICS]
+                values = {key.replace("-", "_"): value for key, value in values.items()}
+                self.report(server_round, self.roster.name(node), kind, values)
         counts = {f"rejected_{reason}": rejected.count(reason) for reason in sorted(set(rejected))}
         if self._sampled:
             counted = {"to": kind, "good": len(valid), "rejected": len(rejected)}
@@ -229,7 +231,3 @@ def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
 
 def _examples(reply: Message) -> Any:
     return reply.content.metric_records[messages.METRICS].get(messages.EXAMPLES)
-
-
-def _values(reply: Message) -> dict[str, Any]:
-    return {key.replace("-", "_"): value for key, value in reply.content.metric_records[messages.METRICS].items()}
