@@ -55,17 +55,14 @@ def _metrics(default: str) -> Flag:
 
 
 def _recipe() -> list[Flag]:
-    return [_field(field, f"{text} (default: {field.default})", field.default) for field, text in _texts(Recipe)]
+    texts = setting_texts(Recipe)
+    return [_field(f, f"{texts[f.name]} (default: {f.default})", f.default) for f in fields(Recipe)]
 
 
 def _settings() -> list[Flag]:
     """A flag for every setting; only given flags override the profile. ``--resume`` is only where runs resume."""
-    settings = [(field, text) for field, text in _texts(Config) if field.name != "resume"]
-    return [_field(field, text.replace("%", "%%"), argparse.SUPPRESS) for field, text in settings]
-
-
-def _texts(settings_class: type) -> list[tuple[Field, str]]:
-    return [(field, setting_texts(settings_class)[field.name]) for field in fields(settings_class)]
+    texts = {name: text.replace("%", "%%") for name, text in setting_texts().items()}
+    return [_field(f, texts[f.name], argparse.SUPPRESS) for f in fields(Config) if f.name != "resume"]
 
 
 def _field(field: Field, text: str, default: Any) -> Flag:

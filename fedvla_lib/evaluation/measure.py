@@ -41,15 +41,9 @@ class Measurement:
 
 
 def measure(
-    bundle: Bundle,
-    store: FrameStore,
-    config: Config,
-    *,
-    episode_ids: Sequence[int] | None = None,
-    seeds: Sequence[int] = (),
-    videos_dir: Path | None = None,
-    progress: bool = False,
-) -> Measurement:
+    bundle: Bundle, store: FrameStore, config: Config, *, episode_ids: Sequence[int] | None = None,
+    seeds: Sequence[int] = (), videos_dir: Path | None = None, progress: bool = False,
+) -> Measurement:  # fmt: skip
     """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task and seed.
 
     Args:

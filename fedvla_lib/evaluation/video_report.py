@@ -46,7 +46,13 @@ def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
 def _read(video: Path) -> dict[str, Any]:
     if not video.is_file():
         raise ValueError("the trajectory has no video")
-    trajectory = _trajectory(video.with_suffix(".npz"))
+    if not (path := video.with_suffix(".npz")).is_file():
+        raise ValueError("the video has no trajectory")
+    try:
+        with np.load(path) as arrays:
+            trajectory = {name: arrays[name] for name in ("actions", "success", "seed")}
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+        raise ValueError(f"its trajectory cannot be read: {error}") from error
     frames, steps = len(read_video(video)), len(trajectory["actions"])
     if frames != steps:
         raise ValueError(f"the video has {frames} frames, its trajectory {steps} steps")
@@ -57,16 +63,6 @@ def _read(video: Path) -> dict[str, Any]:
         "completion_time": steps / FPS if success else float("nan"),
         "action_smoothness": rollouts.smoothness(trajectory["actions"]),
     }  # fmt: skip
-
-
-def _trajectory(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise ValueError("the video has no trajectory")
-    try:
-        with np.load(path) as arrays:
-            return {name: arrays[name] for name in ("actions", "success", "seed")}
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
-        raise ValueError(f"its trajectory cannot be read: {error}") from error
 
 
 def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.DataFrame:

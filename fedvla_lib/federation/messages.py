@@ -65,13 +65,9 @@ def unpack_arrays(record: ArrayRecord) -> Arrays:
 
 
 def checked_arrays(
-    content: RecordDict,
-    digest_in: str,
-    shapes: Shapes,
-    record: str = ARRAYS,
-    also: tuple[str, ...] = (),
-    exchange: str = "float32",
-) -> Arrays:
+    content: RecordDict, digest_in: str, shapes: Shapes, record: str = ARRAYS,
+    also: tuple[str, ...] = (), exchange: str = "float32",
+) -> Arrays:  # fmt: skip
     """Unpack `record` and check names, shapes, finiteness and the SHA-256 in record `digest_in`.
 
     Args:

@@ -197,18 +197,18 @@ def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
 
 def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
     return path + _arc(path[-1], cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
 
 
 def _pull_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
     nearer_m = (*cartesian(radius_m - PULL_M, bearing_rad), DRAG_HEIGHT_M)
     return _grasp_and_move(start, layout.cubes[0], nearer_m, DRAG_HEIGHT_M)
 
 
 def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
     return _sweep(start, layout.cubes[0], radius_m, bearing_rad - NUDGE_RAD)
 
 
@@ -237,12 +237,13 @@ def _polar(x: float, y: float) -> tuple[float, float]:
 
 
 PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
-    "lift": lambda layout, start: _grasp_and_move(start, layout.cubes[0], (*layout.cube_xy_m, LIFT_HEIGHT_M)),
+    "lift": lambda layout, start: _grasp_and_move(start, layout.cubes[0], (*layout.cubes[0].xy_m, LIFT_HEIGHT_M)),
     "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M),
     "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m)),
     "stack": lambda layout, start: _carry(start, layout.cubes[0], layout.cubes[1].xy_m, STACK_HEIGHT_M),
     "sort": _sort_plan,
-    "reach": lambda layout, start: [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cubes[0].yaw_rad, OPEN)],
+    "reach": lambda layout, start: [
+        _move(start, (*layout.cubes[0].xy_m, REACH_HEIGHT_M), layout.cubes[0].yaw_rad, OPEN)],
     "grip": lambda layout, start: _grasp(start, layout.cubes[0]),
     "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan,
     "point_square": _point_plan, "point_circle": _point_plan,

@@ -57,11 +57,6 @@ class Layout:
         return self.cubes[0].color
 
     @property
-    def cube_xy_m(self) -> tuple[float, float]:
-        """Centre of the first cube."""
-        return self.cubes[0].xy_m
-
-    @property
     def zone_xy_m(self) -> tuple[float, float] | None:
         """Centre of the first zone; None without a zone."""
         return self.zones_xy_m[0] if self.zones_xy_m else None

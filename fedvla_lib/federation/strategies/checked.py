@@ -44,16 +44,9 @@ class Checked:
     _extra_records: tuple[str, ...] = ()  # records of arrays in a training reply beside the model's
 
     def __init__(
-        self,
-        *,
-        config: Config,
-        roster: Roster,
-        shapes: Shapes,
-        report: Report,
-        keep_rollouts: Callable[[int, str, messages.Rollouts], None],
-        rounds_done: int = 0,
-        **flower: Any,
-    ) -> None:
+        self, *, config: Config, roster: Roster, shapes: Shapes, report: Report,
+        keep_rollouts: Callable[[int, str, messages.Rollouts], None], rounds_done: int = 0, **flower: Any,
+    ) -> None:  # fmt: skip
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.config, self.roster, self.shapes = config, roster, shapes
         self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
@@ -66,15 +59,17 @@ class Checked:
     ) -> Iterable[Message]:
         """Sample clients and address the global arrays, with their SHA-256, to each."""
         self._global = messages.unpack_arrays(arrays)
-        self._sample(self.config.fraction_train, server_round, 0)
-        return self._addressed(super().configure_train, server_round, arrays, config)
+        sampled = self._sample(self.config.fraction_train, server_round, 0)
+        return super().configure_train(server_round + self.rounds_done, arrays, config, sampled)
 
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """The same for evaluation; other clients may be sampled."""
-        self._sample(self.config.fraction_evaluate, server_round, 1)
-        return self._addressed(super().configure_evaluate, server_round, arrays, config) if self._sampled else []
+        sampled = self._sample(self.config.fraction_evaluate, server_round, 1)
+        if not self._sampled:
+            return []
+        return super().configure_evaluate(server_round + self.rounds_done, arrays, config, sampled)
 
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
@@ -118,14 +113,15 @@ class Checked:
             listed = all(name.isdecimal() for name in arrays)
             setattr(self, attribute, [arrays[str(i)] for i in range(len(arrays))] if listed else arrays)
 
-    def _downward(self, arrays: ArrayRecord) -> Arrays:
-        return encode(messages.unpack_arrays(arrays), DOWNWARD[self.config.exchange])
-
-    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
-        """Flower's, with encoded arrays; strategies have stored the unrounded ones by now."""
+    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
+        """Flower's, with encoded arrays and their SHA-256; strategies have stored the unrounded ones by now."""
+        arrays = encode(messages.unpack_arrays(record[messages.ARRAYS]), DOWNWARD[self.config.exchange])
+        record[messages.CONFIG][messages.DIGEST] = digest(arrays)
         if self.config.exchange != "float32":
-            record[messages.ARRAYS] = messages.pack_arrays(self._downward(record[messages.ARRAYS]))
-        return super()._construct_messages(record, node_ids, message_type)
+            record[messages.ARRAYS] = messages.pack_arrays(arrays)
+        sent = list(super()._construct_messages(record, node_ids, message_type))
+        self._sent_bytes = sum(messages.count_bytes(message.content) for message in sent)
+        return sent
 
     def _restore(self, reply: Message) -> None:
         """Replace the encoded update in a reply by the arrays: global arrays plus update."""
@@ -150,19 +146,11 @@ class Checked:
         for who, values in geometry(self._global, ends).items():
             self.report(server_round, who, "drift", values)
 
-    def _sample(self, share: float, server_round: int, purpose: int) -> None:
+    def _sample(self, share: float, server_round: int, purpose: int) -> SimpleNamespace:
+        """Sample clients, and return a stand-in for the grid that lists only them."""
         rng = np.random.default_rng([self.config.seed, server_round + self.rounds_done, purpose])
         self._sampled = self.roster.sample(share, rng)
-
-    def _addressed(
-        self, configure: Callable[..., Iterable[Message]], server_round: int, arrays: ArrayRecord, config: ConfigRecord
-    ) -> list[Message]:
-        """Let Flower configure the round on a grid that lists only the sampled nodes; count the bytes sent."""
-        config[messages.DIGEST] = digest(self._downward(arrays))
-        sampled = SimpleNamespace(get_node_ids=lambda: self._sampled)
-        sent = list(configure(server_round + self.rounds_done, arrays, config, sampled))
-        self._sent_bytes = sum(messages.count_bytes(message.content) for message in sent)
-        return sent
+        return SimpleNamespace(get_node_ids=lambda: self._sampled)
 
     def _valid(
         self, server_round: int, kind: str, replies: Iterable[Message], check: Callable[[Message], None]
