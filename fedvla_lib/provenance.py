@@ -91,7 +91,7 @@ def first_stamp(config: Config, engine: str) -> dict[str, Any]:
         "versions": {name: version_of(name) for name in PACKAGES},
         "hardware": {
             "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count(),
-            "device": config.device, "memory_gb": round(memory_gib(), 1),
+            "device": config.device, "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
         },
     }  # fmt: skip
 
@@ -102,11 +102,6 @@ def version_of(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def memory_gib() -> float:
-    """Return the physical memory of this machine in GiB."""
-    return psutil.virtual_memory().total / 2**30
 
 
 def _commit() -> str | None:

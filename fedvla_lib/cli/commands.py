@@ -213,8 +213,6 @@ def search(options: argparse.Namespace) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     """Roll out a saved policy and print its success rates by task."""
-    import pandas as pd
-
     from fedvla_lib.evaluation import rollouts
     from fedvla_lib.policy.actor import PolicyActor
     from fedvla_lib.policy.model import load_policy
@@ -225,9 +223,7 @@ def evaluate(options: argparse.Namespace) -> None:
     actor = PolicyActor(load_policy(chosen), options.seed)
     seeds, videos = rollouts.rollout_seeds(options.rollouts), options.out and options.out / "videos"
     rows = rollouts.evaluate(actor, tasks, seeds, image_size=chosen.image_size, videos_dir=videos)
-    if options.out:
-        write_atomically(options.out / "rows.csv", pd.DataFrame(rows).to_csv(index=False).encode())
-    _print_success(rows)
+    _print_success(rows, options.out and options.out / "rows.csv")
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -290,12 +286,16 @@ def _saved_settings(folder: Path) -> Config:
     return replace(Config(), base=str(folder), image_size=shape[-1], **chunk)
 
 
-def _print_success(rows: list[dict[str, Any]]) -> None:
+def _print_success(rows: list[dict[str, Any]], csv: Path | None = None) -> None:
+    """Print success rates by task, and write the rollouts to a file if one is given."""
     import pandas as pd
 
     from fedvla_lib.evaluation.statistics import success_table
 
-    _print_table(success_table(pd.DataFrame(rows), ["task"]))
+    table = pd.DataFrame(rows)
+    if csv:
+        write_atomically(csv, table.to_csv(index=False).encode())
+    _print_table(success_table(table, ["task"]))
 
 
 def _require_positive(flag: str, value: int) -> None:

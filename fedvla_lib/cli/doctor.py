@@ -173,10 +173,10 @@ def check_cache(folder: Path) -> Check:
 def check_memory(min_gib: float = MIN_MEMORY_GIB) -> Check:
     """Check the memory of the machine."""
     try:
-        from fedvla_lib.provenance import memory_gib
+        import psutil
     except ImportError as error:
         return Check("memory", False, f"unknown: {error}", "make env", required=False)
-    total_gib, fix = memory_gib(), "close other programs, or use FEDVLA_PROFILE=tiny"
+    total_gib, fix = psutil.virtual_memory().total / 2**30, "close other programs, or use FEDVLA_PROFILE=tiny"
     return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", fix, required=False)
 
 
@@ -184,10 +184,9 @@ def check_threads(cores: int | None = None) -> Check:
     """Compare the thread counts set for numerical libraries with the cores granted to this process."""
     cores = cores or granted_cores()
     settings = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
-    over = [f"{name}={value}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
+    over = [f"{name}={cores}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
     found = f"{cores} cores granted" + "".join(f", {name}={value}" for name, value in settings.items())
-    names = " ".join(f"{item.split('=')[0]}={cores}" for item in over)
-    fix = f"export {names}: more threads than cores are far slower"
+    fix = f"export {' '.join(over)}: more threads than cores are far slower"
     return Check("threads", not over, found, fix, required=False)
 
 

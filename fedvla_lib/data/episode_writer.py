@@ -122,7 +122,6 @@ def _episode_files(root: Path, index: int) -> list[Path]:
 
 
 def _stats_of(root: Path, index: int) -> dict[str, dict[str, np.ndarray]]:
-    """Read the statistics of one episode from its metadata."""
     row = pq.read_table(root / _file_name(DEFAULT_EPISODES_PATH, index)).to_pylist()[0]
     flat = {key.removeprefix("stats/"): value for key, value in row.items() if key.startswith("stats/")}
     return unflatten_dict({key: np.atleast_1d(np.array(value)) for key, value in flat.items()})

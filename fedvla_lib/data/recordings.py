@@ -16,9 +16,8 @@ def resolve(config: Config) -> Path | str:
     if config.data:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
-    tasks = task_names(config)
-    settings = [tasks, config.image_size, config.episodes_per_task, config.seed, config.num_labs]
-    key = json.dumps([*settings, code_digest(record)])
+    tasks, counts = task_names(config), [config.image_size, config.episodes_per_task, config.seed, config.num_labs]
+    key = json.dumps([tasks, *counts, code_digest(record)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     return record_into(cache_dir() / "recordings" / name, config)
 

@@ -29,10 +29,9 @@ from fedvla_lib.policy.model import Bundle
 # First rollout seed of reports. Not used by chapters; comparison.toml and normalisation.toml share it. Trials make no
 # rollouts, so these rollouts select nothing.
 ROLLOUTS_FROM = 3_000_000
-LOCAL_STEPS = (1, 2, 5, 10, 20)
+LOCAL_STEPS, SHARES = (1, 2, 5, 10, 20), (0.1, 0.2, 0.4, 1.0)
 # A client raises if its loss is not finite, and the server stops when too few replies are usable.
 DIVERGED = (FloatingPointError, TooFewReplies)
-SHARES = (0.1, 0.2, 0.4, 1.0)
 
 
 def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, Any]:
@@ -60,7 +59,6 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
             "select by and half to report on"
         )
     study = _run_trials(config, trials, out)
-    ended = {"status": "completed", "code": methods.trained_by()}
     result = {
         "budget": methods.total_steps(config),
         "trials": [
@@ -70,7 +68,7 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
         "winner": study.best_params, "selection_loss": study.best_value,
         "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
         "first_rollout_seed": ROLLOUTS_FROM, "config": asdict(given),
-        "stamp": provenance.first_stamp(given, "search") | ended,
+        "stamp": provenance.first_stamp(given, "search") | {"status": "completed", "code": methods.trained_by()},
     }  # fmt: skip
     write_json(out / "search.json", result)
     return result

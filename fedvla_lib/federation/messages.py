@@ -22,11 +22,7 @@ from fedvla_lib.federation.quantisation import check_encoded, decode
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest
 from fedvla_lib.robot.spec import JOINT_NAMES
 
-ARRAYS = "arrays"
-CONTROL = "control"
-CONFIG = "config"
-METRICS = "metrics"
-NOTE = "note"
+ARRAYS, CONTROL, CONFIG, METRICS, NOTE = "arrays", "control", "config", "metrics", "note"  # records
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
@@ -119,8 +115,7 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     """Return the rollouts of an evaluation reply.
 
     Raises:
-        ParameterError: they cannot be read, or a file name is not a rollout's, so that a client cannot choose where the
-            server writes.
+        ParameterError: they cannot be read, or a file name is not a rollout's: clients must not choose where we write.
     """
     note = content.config_records.get(NOTE, {})
     try:

@@ -20,9 +20,7 @@ from fedvla_lib.files import cache_dir, new_folder
 PACKAGE = "fedvla-lib"
 NANO, NANO_RANDOM = "nano", "nano-random"  # values of Config.base
 WEIGHTS_FILE = "model.safetensors"
-WIDTH = 128
-TEXT_LAYERS = 4
-VISION_LAYERS = 3
+WIDTH, TEXT_LAYERS, VISION_LAYERS = 128, 4, 3
 PATCHES_PER_SIDE = 8  # the patch size scales with the image size, so compute is constant
 CONNECTOR_SCALE = 2  # pixel shuffle merges 2 x 2 patches into one token: 16 tokens per camera
 VOCAB_SIZE = 384
@@ -39,11 +37,7 @@ CORPUS = [
 
 
 def ensure_nano(image_size: int) -> Path:
-    """Return the cached folder of the nano backbone for `image_size` pixels; write it if it does not exist.
-
-    Raises:
-        ValueError: `image_size` is not a multiple of the number of patches per side.
-    """
+    """Return the cached folder of the nano backbone for `image_size` pixels, written if missing; see `write_nano`."""
     folder = cache_dir() / f"nano-vlm-{image_size}"
     if not (folder / "config.json").exists():
         with new_folder(folder) as draft:
@@ -52,7 +46,7 @@ def ensure_nano(image_size: int) -> Path:
 
 
 def write_nano(folder: Path, image_size: int) -> None:
-    """Write config, tokenizer and processors of the nano backbone into `folder`."""
+    """Write config, tokenizer and processors of the nano backbone; ValueError unless patches fill `image_size`."""
     if image_size % PATCHES_PER_SIDE:
         raise ValueError(f"image_size={image_size} is not usable: give a multiple of {PATCHES_PER_SIDE} pixels")
     tokenizer = _tokenizer()

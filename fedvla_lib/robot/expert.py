@@ -27,16 +27,12 @@ FORK_GAP_M = 0.040  # distance from the cube's centre at which the fork comes do
 FORK_CONTACT_M = 0.022  # distance while pushing
 GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
 STACK_HEIGHT_M = GRASP_HEIGHT_M + 2 * CUBE_HALF_M
-PUSH_HEIGHT_M = 0.018
-HOVER_HEIGHT_M = 0.075
-CARRY_HEIGHT_M = 0.080
+PUSH_HEIGHT_M, HOVER_HEIGHT_M, CARRY_HEIGHT_M = 0.018, 0.075, 0.080
+REACH_HEIGHT_M, POINT_HEIGHT_M, LIFT_HEIGHT_M = 0.048, 0.055, 0.095
 RISE_M = 0.059  # distance the hand rises after releasing the cube
-REACH_HEIGHT_M = 0.048
-POINT_HEIGHT_M = 0.055
 DRAG_HEIGHT_M = 0.017  # the cube stays on the table
 PULL_M = 0.032
 DRAG_RAD, NUDGE_RAD = np.deg2rad(17.0), np.deg2rad(16.0)
-LIFT_HEIGHT_M = 0.095
 SIDESTEP_M = 0.009  # offset of the open jaws towards the fixed jaw, so that neither touches the cube on the way down
 CLOSE_STEPS = OPEN_STEPS = 4
 MIN_STEPS = 4
@@ -105,7 +101,10 @@ class _Arm:
 
     def solve(self, target: Waypoint) -> np.ndarray:
         """Return joint targets for the grasp point at `target`, float32 (6,), LeRobot units."""
-        self._task.set_target(_pose(target))
+        across, up = np.array([-np.sin(target.yaw_rad), np.cos(target.yaw_rad), 0.0]), np.array([0.0, 0.0, 1.0])
+        # Gripper down: the site's y axis points up, its x axis runs across the jaws.
+        rotation = mink.SO3.from_matrix(np.column_stack([across, up, np.cross(across, up)]))
+        self._task.set_target(mink.SE3.from_rotation_and_translation(rotation, np.array(target.position_m)))
         for _ in range(SOLVER_STEPS):
             velocity = mink.solve_ik(self._configuration, [self._task], 1.0, "daqp", damping=1e-6, limits=self._limits)
             self._configuration.integrate_inplace(velocity, 1.0)
@@ -114,14 +113,6 @@ class _Arm:
         joints = from_radians(self._configuration.q, self._limits_rad)
         joints[-1] = target.gripper
         return joints
-
-
-def _pose(target: Waypoint) -> mink.SE3:
-    """Gripper down: the site's y axis points up, its x axis runs across the jaws."""
-    across = np.array([-np.sin(target.yaw_rad), np.cos(target.yaw_rad), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    rotation = np.column_stack([across, up, np.cross(across, up)])
-    return mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotation), np.array(target.position_m))
 
 
 def _interpolate(start: Waypoint, plan: list[Waypoint]) -> list[Waypoint]:

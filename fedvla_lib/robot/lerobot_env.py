@@ -25,11 +25,7 @@ __path__: list[str] = []  # LeRobot's plugin loader looks for submodules and fai
 @EnvConfig.register_subclass("so100_sim")
 @dataclass
 class So100SimConfig(EnvConfig):
-    """LeRobot's configuration of `So100Env`: two cameras, the joint state, and the instruction as task description.
-
-    Raises:
-        ValueError: unknown task; the message lists the valid ones.
-    """
+    """LeRobot's configuration of `So100Env`: two cameras, joint state, instruction; ValueError for an unknown task."""
 
     task: str = "lift"  # one task, or several separated by commas, which are evaluated and reported separately
     fps: int = FPS

@@ -186,9 +186,8 @@ def task_of(text: str) -> str:
 def check_tasks(names: Iterable[str]) -> list[str]:
     """Return `names` as a list; raise ValueError, listing the valid ones, if one is not a task."""
     names = list(names)
-    for name in names:
-        if name not in ALL_TASKS:
-            raise ValueError(f"unknown task {name!r}: choose one of {', '.join(ALL_TASKS)}")
+    if unknown := [name for name in names if name not in ALL_TASKS]:
+        raise ValueError(f"unknown task {unknown[0]!r}: choose one of {', '.join(ALL_TASKS)}")
     return names
 
 
