@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
-    """Return the settings of a new run, or of the interrupted run to resume; ValueError if it cannot be, with these."""
+    """Return the settings of a new run, or of the run to resume; raise ValueError if it cannot, or not with them."""
     from fedvla_lib.run_folder import hold, read_config, resumable
 
     if not options.resume:
