@@ -61,10 +61,8 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     began, config, work = time.perf_counter(), settings(recipe), _work_folder(recipe)
     stamp = first_stamp(config, "pretrain")
-    recording = record.record(
-        list(PRETRAINING_TASKS), recipe.episodes_per_task, work / "recording", image_size=recipe.image_size,
-        seed=recipe.seed, jitter=recipe.jitter, progress=progress,
-    )  # fmt: skip
+    drawn = {"image_size": recipe.image_size, "seed": recipe.seed, "jitter": recipe.jitter, "progress": progress}
+    recording = record.record(list(PRETRAINING_TASKS), recipe.episodes_per_task, work / "recording", **drawn)
     store = frame_store.open_store(recording, image_size=recipe.image_size)
     episodes = list(store.episodes.episode_id)
     stats = normalisation.episode_stats(store, episodes)
