@@ -70,10 +70,7 @@ def _statements(module: str) -> tuple[str, ...]:
 class _WithoutText(ast.NodeTransformer):
     """Removes imports, docstrings and other bare strings; the parser has already dropped the comments."""
 
-    def visit_Import(self, node: ast.Import) -> None:
-        return None
-
-    visit_ImportFrom = visit_Import
+    visit_Import = visit_ImportFrom = lambda self, node: None
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
@@ -91,27 +88,20 @@ def first_stamp(config: Config, engine: str) -> dict[str, Any]:
     return {
         "status": "running", "engine": engine, "started": now(), "wall_s": None, "commit": _commit(),
         "config_hash": config_hash(config), "seed": config.seed, "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES}, "hardware": _hardware(config),
+        "versions": {name: version_of(name) for name in PACKAGES},
+        "hardware": {
+            "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count(),
+            "device": config.device, "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
+        },
     }  # fmt: skip
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Return the version of an installed package; None for this library in a Flower app bundle."""
     try:
         return version(package)
     except PackageNotFoundError:
-        return None  # in a Flower app bundle this library is not installed
-
-
-def _hardware(config: Config) -> dict[str, Any]:
-    return {
-        "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count(), "device": config.device,
-        "memory_gb": round(memory_gib(), 1),
-    }  # fmt: skip
-
-
-def memory_gib() -> float:
-    """Return the physical memory of this machine in GiB."""
-    return psutil.virtual_memory().total / 2**30
+        return None
 
 
 def _commit() -> str | None:

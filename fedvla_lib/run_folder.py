@@ -31,9 +31,7 @@ from fedvla_lib.files import as_json, write_atomically, write_json
 from fedvla_lib.provenance import config_hash, first_stamp, now
 
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
-GLOBAL = "global"
-LOCK = ".lock"
-METRICS_FILE = "metrics.jsonl"
+GLOBAL, LOCK, METRICS_FILE = "global", ".lock", "metrics.jsonl"
 LOCK_TIMEOUT_S = 1.0  # longer than another process holds the lock just to test it
 
 
@@ -56,10 +54,6 @@ class RunFolder:
     def videos_dir(self, round_number: int, who: str) -> Path:
         """Return the folder of the videos of `who` (``global`` or ``client_K``) in a round."""
         return self.root / "evaluate" / f"round_{round_number}" / who
-
-    def relative(self, path: str | Path | None) -> str | None:
-        """Return `path` relative to the run folder, so that the folder can be moved; None stays None."""
-        return Path(path).relative_to(self.root).as_posix() if path else None
 
 
 @contextmanager
@@ -92,11 +86,7 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
 
 @contextmanager
 def hold(root: Path) -> Iterator[None]:
-    """Lock a run folder for writing.
-
-    Raises:
-        ValueError: another process holds the lock.
-    """
+    """Lock a run folder for writing; raise ValueError if another process holds the lock."""
     try:
         lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S).acquire()
     except Timeout as error:
@@ -132,11 +122,7 @@ def _existing(root: Path) -> Path:
 
 
 def resumable(root: Path, config: Config) -> dict[str, Any]:
-    """Return the stamp of a run that can be resumed with these settings.
-
-    Raises:
-        ValueError: not a run folder, a completed run, or a run with other settings.
-    """
+    """Return the stamp of a run that can be resumed; ValueError if it is none, is completed, or has other settings."""
     stamp, saved = read_stamp(_existing(root)), read_config(root)
     if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to resume")
@@ -202,16 +188,12 @@ def _make_folder(out: Path) -> Path:
         except FileExistsError:
             named += timedelta(seconds=1)
         except OSError as error:
-            message = f"cannot make the run folder {path} ({error.strerror}): give a writable folder as out"
-            raise ValueError(message) from error
+            reason = f"cannot make the run folder {path} ({error.strerror})"
+            raise ValueError(f"{reason}: give a writable folder as out") from error
 
 
 def read_events(root: Path) -> list[dict[str, Any]]:
-    """Return the complete events of a run.
-
-    Raises:
-        ValueError: not a run folder, or a line of ``metrics.jsonl`` is not an event.
-    """
+    """Return the complete events of a run; raise ValueError if it is no run folder, or a line is not an event."""
     path = Path(root) / METRICS_FILE
     if not path.is_file():
         raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")

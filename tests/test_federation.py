@@ -106,7 +106,7 @@ def test_a_model_in_the_cache_keeps_the_steps_that_it_counted_beside_weights_tha
     trained = [methods.centralized(config, progress=False), methods.local_only(config, 1, progress=False)]
     assert methods.counted(config) == {"in_all": 12, "in_a_row": 12}
     assert methods.counted(config, 1) == {"in_all": 6, "in_a_row": 6}  # a share of the steps, not all of them
-    folders = [methods._place(config, name) for name in ("centralized", "local-only-1")]
+    folders = [methods._folder(config, client) for client in (None, 1)]
     for bundle, kept in zip(trained, folders, strict=True):
         assert (kept / methods.STEPS_FILE).is_file()
         assert same(SmolVLAPolicy.from_pretrained(kept).state_dict(), bundle.policy.state_dict())

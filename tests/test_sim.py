@@ -145,7 +145,7 @@ def test_color_changes_the_instruction_and_the_image_but_not_the_layout(task):
 def test_layouts_stay_in_their_regions_and_use_every_color(task):
     rng = np.random.default_rng(0)
     layouts = [draw_layout(TASKS[task], rng) for _ in range(200)]
-    radii = np.array([np.hypot(*layout.cube_xy_m) for layout in layouts])
+    radii = np.array([np.hypot(*layout.cubes[0].xy_m) for layout in layouts])
     low, high = TASKS[task].cube.radius_m
     assert low <= radii.min() < radii.max() <= high
     assert {layout.color for layout in layouts} == set(COLORS)

@@ -28,7 +28,6 @@ from fedvla_lib.federation.messages import (
 )
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies import build
-from fedvla_lib.federation.strategies.fedavg import CheckedFedAvg
 from fedvla_lib.policy.parameters import ParameterError, digest, shapes_of
 
 pytestmark = pytest.mark.unit
@@ -348,13 +347,8 @@ def test_a_client_that_does_not_reply_is_reported():
     events = Events()
     grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
-    strategy = CheckedFedAvg(
-        config=Config(fraction_train=1.0),
-        roster=roster,
-        shapes=SHAPES,
-        report=events.log,
-        keep_rollouts=lambda *_: None,
-    )
+    checked = dict(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None)
+    strategy = build.build_strategy(Config(fraction_train=1.0), {}, **checked)
     messages = strategy.configure_train(1, pack_arrays(GOOD), ConfigRecord(), grid)
     strategy.aggregate_train(1, grid.send_and_receive(messages)[:1])
     assert events.rejected() == {"client_1": "silent"}

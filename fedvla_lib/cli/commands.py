@@ -11,9 +11,11 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from fedvla_lib.config import Config, from_profile, split_names, task_names, to_run_config
+from fedvla_lib.config import Config, from_profile, split_names, to_run_config
+from fedvla_lib.files import write_atomically
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.robot.spec import CAMERAS, image_key
+from fedvla_lib.robot.tasks import TASKS, check_tasks
 
 FAILED = 2  # exit status: bad input, or a run that failed
 DOWN = 3  # exit status of service managers for a service that is not running
@@ -39,42 +41,32 @@ def doctor(options: argparse.Namespace) -> int:
 
 def record(options: argparse.Namespace) -> None:
     """Record demonstrations into a folder, by default into the cache where the chapters look for them."""
-    from fedvla_lib.data.record import record as record_episodes
-    from fedvla_lib.data.recordings import resolve
+    from fedvla_lib.data import recordings
 
     chosen = settings(options, **({"tasks": ",".join(options.task)} if options.task else {}))
-    if options.folder is None:
-        print(resolve(chosen))
-        return
-    scenes = {"image_size": chosen.image_size, "seed": chosen.seed, "num_labs": chosen.num_labs}
-    print(record_episodes(task_names(chosen), chosen.episodes_per_task, options.folder, **scenes))
+    print(recordings.record_into(options.folder, chosen) if options.folder else recordings.resolve(chosen))
 
 
 def pretrain(options: argparse.Namespace) -> None:
     """Pretrain a nano base and print its success rates on pretraining tasks and on unseen ones."""
     import pandas as pd
 
-    from fedvla_lib.pretraining.pretrain import pretrain as make
-    from fedvla_lib.pretraining.pretrain import read_account
+    from fedvla_lib.pretraining import pretrain
 
-    folder = make(Recipe(**{field.name: getattr(options, field.name) for field in fields(Recipe)}), options.out)
-    _print_table(pd.DataFrame(read_account(folder)["success"]))
+    recipe = Recipe(**{field.name: getattr(options, field.name) for field in fields(Recipe)})
+    folder = pretrain.pretrain(recipe, options.out)
+    _print_table(pd.DataFrame(pretrain.read_account(folder)["success"]))
     print(folder)
 
 
 def experts(options: argparse.Namespace) -> None:
     """Print each expert's success rate with its confidence interval."""
-    import pandas as pd
-
     from fedvla_lib.evaluation.rollouts import rollout_seeds
-    from fedvla_lib.evaluation.statistics import success_table
     from fedvla_lib.robot.expert import expert_success
-    from fedvla_lib.robot.tasks import TASKS, check_tasks
 
     _require_positive("--episodes", options.episodes)
     tasks = check_tasks(options.task or list(TASKS))
-    rows = [row for task in tasks for row in expert_success(task, rollout_seeds(options.episodes))]
-    _print_table(success_table(pd.DataFrame(rows), ["task"]))
+    _print_success([row for task in tasks for row in expert_success(task, rollout_seeds(options.episodes))])
 
 
 def config(options: argparse.Namespace) -> None:
@@ -132,11 +124,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
-    """Return the settings of a new run, or of the interrupted run to resume.
-
-    Raises:
-        ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
-    """
+    """Return the settings of a new run, or of the run to resume; raise ValueError if it cannot, or not with them."""
     from fedvla_lib.run_folder import hold, read_config, resumable
 
     if not options.resume:
@@ -170,7 +158,7 @@ def superlink(options: argparse.Namespace) -> int:
     if options.action in ("up", "down"):
         print({"up": service.up, "down": service.down}[options.action](home))
         return 0
-    check, exit_status = (service.status, DOWN) if options.action == "status" else (service.last, FAILED)
+    check, exit_status = {"status": (service.status, DOWN), "last": (service.last, FAILED)}[options.action]
     ok, message = check(home)
     print(message)
     return 0 if ok else exit_status
@@ -183,10 +171,10 @@ def credentials(options: argparse.Namespace) -> None:
     _require_positive("--nodes", options.nodes)
     if options.out.exists():
         raise ValueError(f"--out {options.out} exists: give a new folder, so that no key is overwritten")
-    files = make_server(options.out / "server", options.host)
-    keys = [make_node_key(options.out / "nodes", f"node_{k}") for k in range(options.nodes)]
-    print(f"for the server only: {files.key}\nfor the server: {files.certificate}\nfor all: {files.authority}")
-    for k, key in enumerate(keys):
+    server = make_server(options.out / "server", options.host)
+    print(f"for the server only: {server.key}\nfor the server: {server.certificate}\nfor all: {server.authority}")
+    for k in range(options.nodes):
+        key = make_node_key(options.out / "nodes", f"node_{k}")
         print(f"for node {k} only: {key.private}; its public key, to be registered: {key.public}")
 
 
@@ -219,9 +207,9 @@ def _jobs(options: argparse.Namespace) -> int:
 
 def search(options: argparse.Namespace) -> None:
     """Search for settings; print the budget, the best settings and their results on data not used for the search."""
-    from fedvla_lib.experiments.search import search as search_settings
+    from fedvla_lib.experiments import search
 
-    found = search_settings(settings(options), options.trials, options.rollouts, options.search_out)
+    found = search.search(settings(options), options.trials, options.rollouts, options.search_out)
     print(f"{len(found['trials'])} trials of {found['budget']} gradient steps each")
     print("winner: " + ", ".join(f"{name.replace('_', '-')}={value:.3g}" for name, value in found["winner"].items()))
     for name in ("start", "best"):
@@ -232,26 +220,18 @@ def search(options: argparse.Namespace) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     """Roll out a saved policy and print its success rates by task."""
-    import pandas as pd
-
-    from fedvla_lib.evaluation.rollouts import evaluate as roll_out
-    from fedvla_lib.evaluation.rollouts import rollout_seeds
-    from fedvla_lib.evaluation.statistics import success_table
-    from fedvla_lib.files import write_atomically
+    from fedvla_lib.evaluation import rollouts
     from fedvla_lib.policy.actor import PolicyActor
     from fedvla_lib.policy.model import load_policy
-    from fedvla_lib.robot.tasks import TASKS, check_tasks
 
     _require_positive("--rollouts", options.rollouts)
     tasks = check_tasks(options.task or list(TASKS))
     chosen = _saved_settings(options.policy)
     actor = PolicyActor(load_policy(chosen), options.seed)
-    seeds, videos = rollout_seeds(options.rollouts), options.out and options.out / "videos"
-    options_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options)}
-    rows = pd.DataFrame(roll_out(actor, tasks, seeds, **options_of))
-    if options.out:
-        write_atomically(options.out / "rows.csv", rows.to_csv(index=False).encode())
-    _print_table(success_table(rows, ["task"]))
+    seeds, videos = rollouts.rollout_seeds(options.rollouts), options.out and options.out / "videos"
+    settings_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options)}
+    rows = rollouts.evaluate(actor, tasks, seeds, **settings_of)
+    _print_success(rows, options.out and options.out / "rows.csv")
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -268,10 +248,7 @@ def compare(options: argparse.Namespace) -> None:
     if differ and not options.allow_mismatch:
         raise ValueError(f"not comparable: {'; '.join(differ)} (--allow-mismatch compares what they have in common)")
     intervals = {"seed": options.seed, "confidence": options.confidence}
-    tables = {
-        "values": compare_runs.values(runs, metrics, **intervals),
-        "differences": compare_runs.differences(runs, metrics, **intervals),
-    }
+    tables = {name: getattr(compare_runs, name)(runs, metrics, **intervals) for name in ("values", "differences")}
     for line in differ:
         print(f"MISMATCH: {line}")
     for table in tables.values():
@@ -290,8 +267,7 @@ def videos(options: argparse.Namespace) -> int:
     metrics = statistics.check_metrics(split_names(options.metrics), video_report.METRICS)
     rows, damaged = video_report.read_videos(options.folder)
     if options.who and len(rows):
-        names = sorted(set(rows.who))
-        if options.who not in names:
+        if options.who not in (names := sorted(set(rows.who))):
             raise ValueError(f"--who {options.who} has no video there: choose from {', '.join(names)}")
         rows = rows[rows.who == options.who]
     if len(rows):
@@ -307,19 +283,27 @@ def videos(options: argparse.Namespace) -> int:
 
 
 def _saved_settings(folder: Path) -> Config:
-    """Return settings that load the policy saved in `folder` as it was trained.
-
-    Raises:
-        ValueError: not a pretrained_model folder, or a policy without our cameras.
-    """
-    if not (folder / "config.json").is_file():
+    """Return settings that load the policy saved in `folder` as it was trained."""
+    if not (file := folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
-    saved = json.loads((folder / "config.json").read_text())
+    saved = json.loads(file.read_text())
     shape = saved.get("input_features", {}).get(image_key(CAMERAS[0]), {}).get("shape")
     if not shape:
         raise ValueError(f"{folder} has no camera {CAMERAS[0]!r}: the simulator shows {', '.join(CAMERAS)}")
     chunk = {name: saved[name] for name in ("chunk_size", "n_action_steps")}
     return replace(Config(), base=str(folder), image_size=shape[-1], **chunk)
+
+
+def _print_success(rows: list[dict[str, Any]], csv: Path | None = None) -> None:
+    """Print success rates by task, and write the rollouts to a file if one is given."""
+    import pandas as pd
+
+    from fedvla_lib.evaluation.statistics import success_table
+
+    table = pd.DataFrame(rows)
+    if csv:
+        write_atomically(csv, table.to_csv(index=False).encode())
+    _print_table(success_table(table, ["task"]))
 
 
 def _require_positive(flag: str, value: int) -> None:

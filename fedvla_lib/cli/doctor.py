@@ -60,20 +60,17 @@ class Check:
 
 def check_interpreter(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
     """Check the Python version."""
-    ok = tuple(version[:2]) >= MIN_PYTHON
-    wanted = ".".join(map(str, MIN_PYTHON))
+    wanted, found = (".".join(map(str, one)) for one in (MIN_PYTHON, version))
     fix = f"install Python {wanted}, or let uv install it: rm -r .venv && make env"
-    return Check("interpreter", ok, f"Python {'.'.join(map(str, version))} on {platform.platform(terse=True)}", fix)
+    ok = tuple(version[:2]) >= MIN_PYTHON
+    return Check("interpreter", ok, f"Python {found} on {platform.platform(terse=True)}", fix)
 
 
 def check_packages(requirements: Iterable[str] | None = None) -> Check:
     """Check the installed version of every package in `requirements` (default: the library's dependencies)."""
-    if requirements is None:
-        requirements = importlib.metadata.requires("fedvla-lib") or []
-    parsed = [Requirement(line) for line in requirements]
-    wanted = [item for item in parsed if item.marker is None or item.marker.evaluate({"extra": ""})]
-    problems = [problem for item in wanted if (problem := _package_problem(item))]
-    found = "; ".join(problems) or f"{len(wanted)} packages, all in range"
+    declared = (importlib.metadata.requires("fedvla-lib") or []) if requirements is None else requirements
+    count, problems = _problems(declared)
+    found = "; ".join(problems) or f"{count} packages, all in range"
     return Check("packages", not problems, found, "make env (it installs requirements.lock)")
 
 
@@ -81,11 +78,15 @@ def check_lock(lock: Path) -> Check:
     """Compare installed with pinned versions; a difference is only a note, since other versions may work."""
     if not lock.is_file():
         return Check("lock", False, f"{lock} does not exist", "run it in the folder of the book", required=False)
-    pins = [Requirement(line.rstrip("\\ ")) for line in lock.read_text().splitlines() if "==" in line]
-    pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate()]
-    problems = [problem for pin in pins if (problem := _package_problem(pin))]
-    found = f"{len(pins) - len(problems)} of {len(pins)} packages as pinned"
+    count, problems = _problems(line.rstrip("\\ ") for line in lock.read_text().splitlines() if "==" in line)
+    found = f"{count - len(problems)} of {count} packages as pinned"
     return Check("lock", not problems, "; ".join([found, *problems[:3]]), "make env", required=False)
+
+
+def _problems(lines: Iterable[str]) -> tuple[int, list[str]]:
+    """Return how many of the requirements apply to this system, and what is wrong with the installed versions."""
+    required = [item for item in map(Requirement, lines) if item.marker is None or item.marker.evaluate({"extra": ""})]
+    return len(required), [problem for item in required if (problem := _package_problem(item))]
 
 
 def _package_problem(requirement: Requirement) -> str:
@@ -102,20 +103,18 @@ def _package_problem(requirement: Requirement) -> str:
 def check_rendering(timeout_s: float = RENDER_TIMEOUT_S) -> Check:
     """Render a frame with MuJoCo in a separate process and check its pixels."""
     backend = os.environ.get("MUJOCO_GL", "")
-    command = [sys.executable, "-c", DRAW_A_FRAME]
+    label, fix = f"MUJOCO_GL={backend or '(not set)'}", _rendering_fix(backend)
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        result = subprocess.run([sys.executable, "-c", DRAW_A_FRAME], capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        return Check("rendering", False, f"no frame within {timeout_s:g} s", _rendering_fix(backend))
-    label = f"MUJOCO_GL={backend or '(not set)'}"
+        return Check("rendering", False, f"no frame within {timeout_s:g} s", fix)
     if result.returncode:
         lines = result.stderr.strip().splitlines() or [f"MuJoCo ended with exit status {result.returncode}"]
         reason = next((line for line in reversed(lines) if "Error" in line), lines[-1])
-        return Check("rendering", False, f"{label}: {reason.strip()}", _rendering_fix(backend))
+        return Check("rendering", False, f"{label}: {reason.strip()}", fix)
     red, green, blue, *corner = (float(value) for value in result.stdout.split()[-6:])
     ok = red > 100 and red > 1.5 * max(green, blue, *corner)  # bright, red, and only in the middle
-    found = f"{label}: a red box was rendered as RGB ({red:.0f}, {green:.0f}, {blue:.0f})"
-    return Check("rendering", ok, found, _rendering_fix(backend))
+    return Check("rendering", ok, f"{label}: a red box was rendered as RGB ({red:.0f}, {green:.0f}, {blue:.0f})", fix)
 
 
 def _rendering_fix(backend: str) -> str:
@@ -139,25 +138,16 @@ def check_video(codecs: Iterable[str] = CODECS) -> Check:
 
 def _round_trip_error(codec: str, num_frames: int = 8, size: int = 64) -> float:
     """Return the mean absolute pixel error (out of 255) of a decoded short video; infinity if frames are lost."""
-    import av
     import numpy as np
+    from imageio import v3 as imageio
 
     frames = np.full((num_frames, size, size, 3), 40, np.uint8)
     for index in range(num_frames):
         frames[index, 16:48, 4 * index : 4 * index + 24] = (200, 60, 60)
     with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "square.mp4")
-        with av.open(path, "w") as container:
-            stream = container.add_stream(codec, rate=10)
-            stream.width, stream.height, stream.pix_fmt = size, size, "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-            container.mux(stream.encode())
-        with av.open(path) as container:
-            decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    if len(decoded) != num_frames:
-        return float("inf")
-    return float(np.abs(np.stack(decoded).astype(float) - frames).mean())
+        imageio.imwrite(video := Path(folder) / "square.mp4", frames, plugin="pyav", codec=codec, fps=10)
+        decoded = imageio.imread(video, plugin="pyav")
+    return float(np.abs(decoded.astype(float) - frames).mean()) if len(decoded) == num_frames else float("inf")
 
 
 def check_disk(folder: Path, min_free_gib: float = MIN_FREE_GIB) -> Check:
@@ -183,10 +173,10 @@ def check_cache(folder: Path) -> Check:
 def check_memory(min_gib: float = MIN_MEMORY_GIB) -> Check:
     """Check the memory of the machine."""
     try:
-        from fedvla_lib.provenance import memory_gib
+        import psutil
     except ImportError as error:
         return Check("memory", False, f"unknown: {error}", "make env", required=False)
-    total_gib, fix = memory_gib(), "close other programs, or use FEDVLA_PROFILE=tiny"
+    total_gib, fix = psutil.virtual_memory().total / 2**30, "close other programs, or use FEDVLA_PROFILE=tiny"
     return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", fix, required=False)
 
 
@@ -194,10 +184,9 @@ def check_threads(cores: int | None = None) -> Check:
     """Compare the thread counts set for numerical libraries with the cores granted to this process."""
     cores = cores or granted_cores()
     settings = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
-    over = [f"{name}={value}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
+    over = [f"{name}={cores}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
     found = f"{cores} cores granted" + "".join(f", {name}={value}" for name, value in settings.items())
-    names = " ".join(f"{item.split('=')[0]}={cores}" for item in over)
-    fix = f"export {names}: more threads than cores are far slower"
+    fix = f"export {' '.join(over)}: more threads than cores are far slower"
     return Check("threads", not over, found, fix, required=False)
 
 

@@ -16,9 +16,8 @@ from fedvla_lib.cli.parser import build_parser
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # the library raises these with a message for users
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-SIGNALS = [
-    getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
-]  # from kill, from a closing terminal
+# From kill, and from a closing terminal.
+SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except EXPECTED as error:
         if options.traceback:
             traceback.print_exc()
-        print(f"fedvla {options.command}: {_one_line(error)}", file=sys.stderr)
+        message = " ".join(str(error).split()) or type(error).__name__
+        print(f"fedvla {options.command}: {message}", file=sys.stderr)
         return FAILED
 
 
@@ -49,7 +49,3 @@ def _signals_as_ctrl_c() -> Iterator[None]:
     finally:
         for sign in handled:
             signal.signal(sign, signal.SIG_DFL)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -13,8 +13,8 @@ def augmented(images: dict[str, np.ndarray], rng: np.random.Generator) -> dict[s
     Shifts are drawn per camera, as if its mount had moved; contrast and brightness are the same for all cameras.
     """
     batch_size = len(next(iter(images.values())))
-    contrast = _column(rng.uniform(1 - CONTRAST, 1 + CONTRAST, batch_size))
-    brightness = _column(rng.uniform(-BRIGHTNESS, BRIGHTNESS, batch_size))
+    drawn = rng.uniform(1 - CONTRAST, 1 + CONTRAST, batch_size), rng.uniform(-BRIGHTNESS, BRIGHTNESS, batch_size)
+    contrast, brightness = torch.from_numpy(np.array(drawn, np.float32)).reshape(2, -1, 1, 1, 1)
     result = {}
     for camera, pixels in images.items():
         image = to_float(_shift(pixels, rng))  # (B, 3, H, W)
@@ -37,7 +37,3 @@ def to_float(images: np.ndarray) -> torch.Tensor:
     """uint8 (B, H, W, 3) -> float32 (B, 3, H, W) in [0, 1]."""
     channels_first = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
     return channels_first.to(torch.float32).div_(255.0)
-
-
-def _column(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(values.astype(np.float32)).reshape(-1, 1, 1, 1)

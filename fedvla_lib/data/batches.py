@@ -21,16 +21,13 @@ ORDER_STREAM, AUGMENT_STREAM = 0, 1  # independent random streams of one seed
 
 
 def frame_rows(store: FrameStore, episode_ids: Iterable[int]) -> np.ndarray:
-    """Return the store's rows of these episodes, int64 (n,), in ascending order.
-
-    Raises:
-        ValueError: no episodes, or one that is not in the store.
-    """
+    """Return the store's rows of these episodes, int64 (n,), ascending; raise ValueError for none or an unknown one."""
     table = store.episodes.set_index("episode_id")
     ids = sorted({int(episode_id) for episode_id in episode_ids})
-    unknown = [episode_id for episode_id in ids if episode_id not in table.index]
-    if unknown or not ids:
-        raise ValueError(f"{store.root} has no episode {unknown[0]}" if unknown else "no episodes: give at least one")
+    if not ids:
+        raise ValueError("no episodes: give at least one")
+    if unknown := [episode_id for episode_id in ids if episode_id not in table.index]:
+        raise ValueError(f"{store.root} has no episode {unknown[0]}")
     return np.concatenate([np.arange(table.at[i, "start"], table.at[i, "end"]) for i in ids])
 
 

@@ -52,7 +52,9 @@ class EpisodeWriter:
             streaming_encoding=True, encoder_queue_maxsize=MAX_EPISODE_FRAMES,
         )  # fmt: skip
         if num_recorded:
-            _copy_meta(root, self._staging, num_recorded)
+            # What LeRobot needs to resume, without the files of an episode that is not counted yet.
+            for name in [*SHARED_FILES, *(_file_name(DEFAULT_EPISODES_PATH, index) for index in range(num_recorded))]:
+                _put(root / name, self._staging / name)
             self._dataset = LeRobotDataset.resume(**writing)
         else:
             self._dataset = LeRobotDataset.create(
@@ -120,16 +122,9 @@ def _episode_files(root: Path, index: int) -> list[Path]:
 
 
 def _stats_of(root: Path, index: int) -> dict[str, dict[str, np.ndarray]]:
-    """Read the statistics of one episode from its metadata."""
     row = pq.read_table(root / _file_name(DEFAULT_EPISODES_PATH, index)).to_pylist()[0]
     flat = {key.removeprefix("stats/"): value for key, value in row.items() if key.startswith("stats/")}
     return unflatten_dict({key: np.atleast_1d(np.array(value)) for key, value in flat.items()})
-
-
-def _copy_meta(root: Path, staging: Path, num_recorded: int) -> None:
-    """Copy the metadata that LeRobot needs to resume, without the files of an episode that is not counted yet."""
-    for name in [*SHARED_FILES, *(_file_name(DEFAULT_EPISODES_PATH, index) for index in range(num_recorded))]:
-        _put(root / name, staging / name)
 
 
 def _put(source: Path, target: Path) -> None:

@@ -83,7 +83,6 @@ def open_store(
 
 
 def _build(dataset: ReadDataset, image_size: int, folder: Path, progress: bool) -> None:
-    """Write a store's files into `folder`."""
     np.save(folder / "states.npy", dataset.states)
     np.save(folder / "actions.npy", dataset.actions)
     dataset.episodes.to_json(folder / "episodes.json", orient="records", indent=1)

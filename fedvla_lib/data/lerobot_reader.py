@@ -7,9 +7,10 @@ it yields into arrays.
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from huggingface_hub import snapshot_download
-from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from PIL import Image
 
@@ -52,11 +52,11 @@ def locate(source: str | Path) -> Path:
         raise DataError(f"no data set at {source}: give a folder, or a hub id like lerobot/svla_so100_pickplace")
     if (HF_LEROBOT_HOME / source / "meta/info.json").exists():
         return HF_LEROBOT_HOME / source
+    options = {"repo_type": "dataset", "revision": FORMAT, "cache_dir": HF_LEROBOT_HUB_CACHE}
     try:
-        folder = snapshot_download(str(source), repo_type="dataset", revision=FORMAT, cache_dir=HF_LEROBOT_HUB_CACHE)
-        return Path(folder)
-    except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, OSError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        return Path(snapshot_download(str(source), **options))
+    except OSError as error:  # of the network, and all errors of the hub
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(
             f"cannot get data set {str(source)!r} from the Hugging Face hub ({type(error).__name__}: {reason}); with a "
             f"network connection run `hf download {source} --repo-type dataset --revision {FORMAT} --local-dir DIR` "
@@ -78,11 +78,7 @@ class ReadDataset:
 
 
 def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
-    """Read and check everything but the images.
-
-    Raises:
-        DataError: the data set is broken, or is not of an SO-100.
-    """
+    """Read and check everything but the images; raise DataError if it is broken, or not of an SO-100."""
     info = _read_info(root)
     _check_features(root, info)
     files = _read_episodes(root, info)
@@ -116,30 +112,22 @@ def _check_features(root: Path, info: dict[str, Any]) -> None:
     """Require state and action to be six numbers with the names and the order of the SO-100's joints."""
     path = root / "meta/info.json"
     for key in (STATE_KEY, ACTION_KEY):
-        feature = info["features"].get(key)
-        if feature is None:
+        if (feature := info["features"].get(key)) is None:
             raise DataError(f"{path} has no feature {key}: every episode lacks it")
-        if tuple(feature["shape"]) != (NUM_JOINTS,):
-            shape = tuple(feature["shape"])
+        if (shape := tuple(feature["shape"])) != (NUM_JOINTS,):
             raise DataError(f"{path}, every episode: {key} has shape {shape}, an SO-100 has ({NUM_JOINTS},)")
-        names = _flat_names(feature.get("names"))
-        if [_plain(name) for name in names] != [_plain(name) for name in JOINT_NAMES]:
+        names = feature.get("names") or []  # a list, or {"motors": [...]}
+        names = [str(name) for name in (chain(*names.values()) if isinstance(names, Mapping) else names)]
+        if _plain(names) != _plain(JOINT_NAMES):
             raise DataError(
                 f"{path}, every episode: {key} has the columns {', '.join(names) or 'nothing'}, "
                 f"but must have {', '.join(JOINT_NAMES)} in this order"
             )
 
 
-def _flat_names(names: Any) -> list[str]:
-    """Flatten names given as a list or as ``{"motors": [...]}``."""
-    if isinstance(names, Mapping):
-        names = [name for part in names.values() for name in part]
-    return [str(name) for name in names or []]
-
-
-def _plain(name: str) -> str:
-    """Return the joint name that ``main_shoulder_pan`` and ``shoulder_pan.pos`` share."""
-    return name.removeprefix("main_").removesuffix(".pos")
+def _plain(names: Iterable[str]) -> list[str]:
+    """Return the joint names that ``main_shoulder_pan`` and ``shoulder_pan.pos`` share."""
+    return [name.removeprefix("main_").removesuffix(".pos") for name in names]
 
 
 def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | None) -> dict[str, str]:
@@ -159,18 +147,15 @@ def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | 
 
 def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
     """Return the episode table in order, without rows that info.json does not count."""
-    tables = []
+    tables = [pd.DataFrame({"episode_index": []})]
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         file = _parquet(path, "all")
         columns = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
         tables.append(file.read(columns=columns).to_pandas())
-    total = info["total_episodes"]
-    if not total:
+    if not (total := info["total_episodes"]):
         raise DataError(f"{root} has no complete episode: record some first")
-    table = pd.concat(tables) if tables else pd.DataFrame({"episode_index": []})
-    table = table.sort_values("episode_index").set_index("episode_index", drop=False)
-    lacking = sorted(set(range(total)) - set(table.index))
-    if lacking:
+    table = pd.concat(tables[1:] or tables).sort_values("episode_index").set_index("episode_index", drop=False)
+    if lacking := sorted(set(range(total)) - set(table.index)):
         raise DataError(f"{root / 'meta/episodes'}: episode {lacking[0]} is not listed, info.json counts {total}")
     return table.loc[range(total)].reset_index(drop=True)
 
@@ -186,31 +171,25 @@ def _parquet(path: Path, episodes: Any) -> pq.ParquetFile:
 
 def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Return checked states and actions of all episodes, float32 (N, 6) each, and the lab of each episode."""
-    columns = ["episode_index", "timestamp", STATE_KEY, ACTION_KEY]
-    has_labs = LAB_KEY in info["features"]
-    columns += [LAB_KEY] if has_labs else []
+    columns = ["episode_index", "timestamp", STATE_KEY, ACTION_KEY, *([LAB_KEY] if LAB_KEY in info["features"] else [])]
     parts: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for (chunk, file), group in files.groupby(["data/chunk_index", "data/file_index"]):
         first_id = group["episode_index"].iloc[0]
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
         parquet = _parquet(path, first_id)
-        lacking = [name for name in columns if name not in parquet.schema_arrow.names]
-        if lacking:
+        if lacking := [name for name in columns if name not in parquet.schema_arrow.names]:
             raise DataError(f"{path} (episode {first_id}) has no column {', '.join(lacking)}")
         table = parquet.read(columns=columns).to_pandas()
         for episode_id, length in zip(group["episode_index"], group["length"], strict=True):
             rows = table[table["episode_index"] == episode_id]
-            lab = int(rows[LAB_KEY].iloc[0]) if has_labs and len(rows) else 0
-            parts[episode_id] = (*_check_rows(path, episode_id, rows, length, info["fps"]), lab)
+            checked = _check_rows(f"{path}, episode {episode_id}", rows, length, info["fps"])
+            parts[episode_id] = (*checked, int(rows[LAB_KEY].iloc[0]) if LAB_KEY in rows else 0)
     states, actions, labs = zip(*(parts[episode_id] for episode_id in files["episode_index"]), strict=True)
     return np.concatenate(states), np.concatenate(actions), list(labs)
 
 
-def _check_rows(
-    path: Path, episode_id: int, rows: pd.DataFrame, length: int, fps: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _check_rows(episode: str, rows: pd.DataFrame, length: int, fps: float) -> tuple[np.ndarray, np.ndarray]:
     """Return states and actions of one episode, float32 (T, 6)."""
-    episode = f"{path}, episode {episode_id}"
     if len(rows) != length:
         raise DataError(f"{episode}: has {len(rows)} frames, its metadata says {length}")
     drift = np.abs(rows["timestamp"].to_numpy() - np.arange(length) / fps)
@@ -237,11 +216,7 @@ def _vectors(episode: str, key: str, column: pd.Series) -> np.ndarray:
 
 
 def read_images(dataset: ReadDataset, key: str) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each frame of one camera once, as (store row, uint8 (H, W, 3)).
-
-    Raises:
-        DataError: a file is missing or damaged.
-    """
+    """Yield each frame of one camera once: store row, uint8 (H, W, 3); raise DataError if a file is damaged or gone."""
     info, starts = dataset.info, dataset.episodes["start"].to_numpy()
     kind, pattern, read = "data", "data_path", _still_images
     if info["features"][key]["dtype"] == "video":
@@ -257,11 +232,8 @@ def _video_images(
     """Yield the frames of the episodes in `group`, all in the video `path`; the frame at t s has number t * fps."""
     first = np.round(group[f"videos/{key}/from_timestamp"].to_numpy() * fps).astype(int)
     lengths = group["length"].to_numpy()
-    rows = {
-        frame + step: start + step
-        for frame, start, length in zip(first, starts, lengths, strict=True)
-        for step in range(length)
-    }
+    steps = np.concatenate([np.arange(length) for length in lengths])
+    rows = dict(zip(np.repeat(first, lengths) + steps, np.repeat(starts, lengths) + steps, strict=True))
     for number, image in _decode(path, fps, group["episode_index"].iloc[0]):
         if number in rows:
             yield rows.pop(number), image
@@ -304,5 +276,5 @@ def _still_images(
             try:
                 yield start + step, np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB"))
             except (OSError, TypeError) as error:
-                message = f"{path}, episode {episode_id}: image {step} of {key} cannot be read: {error}"
-                raise DataError(message) from error
+                where = f"{path}, episode {episode_id}"
+                raise DataError(f"{where}: image {step} of {key} cannot be read: {error}") from error

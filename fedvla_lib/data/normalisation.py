@@ -34,12 +34,6 @@ def pool_stats(stats: Sequence[Stats]) -> Stats:
     return aggregate_stats(list(stats))
 
 
-def identity_stats() -> Stats:
-    """Return statistics that leave state and action unchanged: mean 0 and std 1 of each joint."""
-    identity = {"mean": np.zeros(NUM_JOINTS), "std": np.ones(NUM_JOINTS)}
-    return {STATE_KEY: identity, ACTION_KEY: identity}
-
-
 def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
     values = values.astype(np.float64)
     stats = {name: getattr(values, name)(axis=0) for name in ("mean", "std", "min", "max")}
@@ -47,8 +41,9 @@ def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def common_statistics(config: Config, pooled: Stats) -> Stats:
-    """Return the statistics sent to all clients: the pooled ones, or identity if normalisation is off."""
-    return identity_stats() if config.normalisation == "none" else pooled
+    """Return the statistics sent to all clients: the pooled ones, or mean 0 and std 1 if normalisation is off."""
+    identity = {"mean": np.zeros(NUM_JOINTS), "std": np.ones(NUM_JOINTS)}
+    return {STATE_KEY: identity, ACTION_KEY: identity} if config.normalisation == "none" else pooled
 
 
 def evaluation_statistics(config: Config, common: Stats, store: FrameStore) -> Stats:

@@ -18,9 +18,7 @@ def split(source: FrameStore | pd.DataFrame, val_fraction: float, seed: int) -> 
 
     Of the n episodes of each task, ``round(val_fraction * n)`` are for validation: at least one if ``val_fraction > 0``
     and n > 1, and never all. The frames of an episode are never split.
-
-    Raises:
-        ValueError: `val_fraction` is outside [0, 1].
+    Raises ValueError if `val_fraction` is outside [0, 1].
     """
     if not 0 <= val_fraction <= 1:
         raise ValueError(f"val_fraction={val_fraction} is not usable: give a number from 0 to 1")

@@ -3,10 +3,10 @@
 import json
 import shutil
 import tomllib
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fedvla_lib import provenance
 from fedvla_lib.config import Config, to_run_config
 
 PROJECT = "fedvla-lib"  # name in pyproject.toml and of the installed package
@@ -36,10 +36,7 @@ def _is_checkout(folder: Path) -> bool:
 
 def _project_file(package: str) -> str:
     """Return a minimal pyproject.toml for `flwr`: name, the two apps, the settings and the files to bundle."""
-    try:
-        release = version(PROJECT)
-    except PackageNotFoundError:  # the library was copied, not installed
-        release = "0"
+    release = provenance.version_of(PROJECT) or "0"  # the library may have been copied, not installed
     tables = {
         "project": {"name": PROJECT, "version": release, "description": "", "license": "Apache-2.0"},
         "tool.flwr.app": {"publisher": "fedvla", "fab-include": [f"{package}/**/*.py"]},

@@ -18,8 +18,9 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
+Key, Extension = ec.EllipticCurvePrivateKey, x509.ExtensionType
 PEM, PKCS8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
 NO_PASSWORD = serialization.NoEncryption()
 AUTHORITY, DAYS = "federation authority", 7
@@ -59,25 +60,17 @@ def make_server(folder: Path, hosts: Sequence[str] = (), *, until: datetime | No
     until = until or datetime.now(UTC) + timedelta(days=DAYS)
     authority_key, server_key = ec.generate_private_key(ec.SECP384R1()), ec.generate_private_key(ec.SECP384R1())
     names = [_host(host) for host in dict.fromkeys([*hosts, *LOCAL_HOSTS])]
-    authority = (
-        _certificate(AUTHORITY, authority_key, until)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(CA_USAGE, critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(authority_key.public_key()), critical=False)
-        .sign(authority_key, hashes.SHA256())
-    )
-    server = (
-        _certificate("federation server", server_key, until)
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()), critical=False)
-        .sign(authority_key, hashes.SHA256())
-    )
     folder.mkdir(parents=True, exist_ok=True)
     files = ServerFiles(folder / "ca.crt", folder / "server.pem", folder / "server.key")
-    files.authority.write_bytes(authority.public_bytes(PEM))
-    files.certificate.write_bytes(server.public_bytes(PEM))
+    files.authority.write_bytes(_certificate(AUTHORITY, authority_key, authority_key, until, {
+        x509.BasicConstraints(ca=True, path_length=0): True, CA_USAGE: True,
+        x509.SubjectKeyIdentifier.from_public_key(authority_key.public_key()): False,
+    }))  # fmt: skip
+    files.certificate.write_bytes(_certificate("federation server", server_key, authority_key, until, {
+        x509.SubjectAlternativeName(names): False, x509.BasicConstraints(ca=False, path_length=None): True,
+        x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]): False,
+        x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()): False,
+    }))  # fmt: skip
     _write_secret(files.key, server_key.private_bytes(PEM, PKCS8, NO_PASSWORD))
     return files
 
@@ -92,20 +85,20 @@ def make_node_key(folder: Path, name: str) -> NodeKey:
     return files
 
 
-def _certificate(subject: str, key: ec.EllipticCurvePrivateKey, until: datetime) -> x509.CertificateBuilder:
-    return (
+def _certificate(subject: str, key: Key, signer: Key, until: datetime, extensions: dict[Extension, bool]) -> bytes:
+    """Return a certificate (PEM) of the authority with these extensions, each critical or not."""
+    builder = (
         x509.CertificateBuilder()
-        .subject_name(_name(subject))
-        .issuer_name(_name(AUTHORITY))
+        .subject_name(x509.Name.from_rfc4514_string(f"CN={subject}"))
+        .issuer_name(x509.Name.from_rfc4514_string(f"CN={AUTHORITY}"))
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(min(datetime.now(UTC), until) - timedelta(days=1))  # clocks differ
         .not_valid_after(until)
     )
-
-
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+    for extension, critical in extensions.items():
+        builder = builder.add_extension(extension, critical)
+    return builder.sign(signer, hashes.SHA256()).public_bytes(PEM)
 
 
 def _host(host: str) -> x509.GeneralName:

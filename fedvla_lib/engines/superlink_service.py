@@ -53,9 +53,7 @@ def add_connections(file: Path) -> None:
         ValueError: the file is not valid TOML, or has a different connection with the same name.
     """
     ours = CONNECTIONS.read_text()
-    if not file.exists():
-        return write_atomically(file, ours.encode())
-    text = file.read_text()
+    text = file.read_text() if file.exists() else ours
     try:
         existing = tomllib.loads(text).get("superlink", {})
     except tomllib.TOMLDecodeError as error:
@@ -81,7 +79,7 @@ def down(home: Path) -> str:
 def status(home: Path) -> tuple[bool, str]:
     """Return whether the SuperLink is up, and a status message."""
     process = _running(home)
-    return bool(process), f"{_address()} is {'up, process ' + str(process.pid) if process else 'not up'}"
+    return bool(process), f"{_address()} is {f'up, process {process.pid}' if process else 'not up'}"
 
 
 def last(home: Path) -> tuple[bool, str]:
@@ -102,12 +100,11 @@ def last(home: Path) -> tuple[bool, str]:
 
 def _running(home: Path) -> psutil.Process | None:
     """Return the process that `up` started, if it still runs; start times are compared, as ids are reused."""
-    file = home / "superlink.json"
-    saved = json.loads(file.read_text()) if file.is_file() else {"pid": 0, "created": 0.0}
     try:
+        saved = json.loads((home / "superlink.json").read_text())
         process = psutil.Process(saved["pid"])
         return process if process.create_time() == saved["created"] and process.is_running() else None
-    except psutil.NoSuchProcess:
+    except (FileNotFoundError, psutil.NoSuchProcess):
         return None
 
 

@@ -38,11 +38,7 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """Read from a run folder what is compared.
-
-    Raises:
-        ValueError: not a run folder, or a run without measurements.
-    """
+    """Read from a run folder what is compared; raise ValueError if it is not one, or holds no measurements."""
     folder = Path(folder)
     if not (folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a run folder: it has no config.json")
@@ -94,11 +90,6 @@ def _mismatches(first: Run, other: Run, metrics: Sequence[str]) -> dict[str, str
     return found
 
 
-def _label(first: Run, other: Run, metric: str) -> str:
-    """The table's `mismatch` column: names of what makes a row incomparable; empty if nothing does."""
-    return ", ".join(_mismatches(first, other, [metric]))
-
-
 def _rollout_keys(run: Run) -> set[tuple[Any, ...]]:
     return set(run.rollouts[ROLLOUT_KEY].itertuples(index=False, name=None))
 
@@ -110,21 +101,16 @@ def values(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confidence
     """
     return pd.DataFrame([
         {"run": run.name, "gradient_steps": run.gradient_steps, "metric": metric,
-         **_value(run, metric, seed, confidence), "mismatch": _label(runs[0], run, metric)}
+         **_value(run, metric, seed, confidence), "mismatch": ", ".join(_mismatches(runs[0], run, [metric]))}
         for run in runs for metric in metrics
     ])  # fmt: skip
 
 
 def _value(run: Run, metric: str, seed: int, confidence: float) -> dict[str, float]:
-    if metric != SUCCESS:
-        each = run.episodes[metric].to_numpy()
-        low, high = statistics.mean_interval(each, seed=seed, confidence=confidence)
-        return {"n": len(each), "value": float(each.mean()), "low": low, "high": high}
-    if run.rollouts.empty:
+    if (of_success := metric == SUCCESS) and run.rollouts.empty:
         raise ValueError(f"{run.name} made no rollout: run it with eval-rollouts above 0, or leave out {SUCCESS}")
-    n, successes = len(run.rollouts), int(run.rollouts.success.sum())
-    low, high = statistics.wilson(successes, n, confidence)
-    return {"n": n, "value": successes / n, "low": low, "high": high}
+    each = (run.rollouts.success if of_success else run.episodes[metric]).to_numpy(float)
+    return statistics.mean_with_interval(each, of_success=of_success, seed=seed, confidence=confidence)
 
 
 def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confidence: float) -> pd.DataFrame:
@@ -137,7 +123,7 @@ def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confi
     first = runs[0]
     table = pd.DataFrame([
         {"run": run.name, "against": first.name, "metric": metric,
-         **_difference(run, first, metric, seed, confidence), "mismatch": _label(first, run, metric)}
+         **_difference(run, first, metric, seed, confidence), "mismatch": ", ".join(_mismatches(first, run, [metric]))}
         for metric in metrics for run in runs[1:]
     ])  # fmt: skip
     table = table.assign(p_holm=statistics.holm(table.p_value))
@@ -146,18 +132,15 @@ def differences(runs: Sequence[Run], metrics: Sequence[str], *, seed: int, confi
 
 def _difference(run: Run, first: Run, metric: str, seed: int, confidence: float) -> dict[str, Any]:
     if metric == SUCCESS:
+        what, compare = "rollout", statistics.success_difference
         pairs = run.rollouts.merge(first.rollouts, on=ROLLOUT_KEY, suffixes=("", "_first"))
-        _require_pairs(run, first, len(pairs), "rollout")
-        return statistics.success_difference(pairs.success, pairs.success_first, seed=seed, confidence=confidence)
-    both = run.episodes.index.intersection(first.episodes.index)
-    _require_pairs(run, first, len(both), "held-out episode")
-    left, right = run.episodes.loc[both, metric], first.episodes.loc[both, metric]
-    return statistics.mean_difference(left.to_numpy(), right.to_numpy(), seed=seed, confidence=confidence)
-
-
-def _require_pairs(run: Run, first: Run, count: int, what: str) -> None:
-    if not count:
+        left, right = pairs.success, pairs.success_first
+    else:
+        what, compare = "held-out episode", statistics.mean_difference
+        left, right = run.episodes[metric].align(first.episodes[metric], join="inner")
+    if left.empty:
         raise ValueError(f"{run.name} and {first.name} share no {what}: there is nothing to compare")
+    return compare(left.to_numpy(), right.to_numpy(), seed=seed, confidence=confidence)
 
 
 def write(out: Path, runs: Sequence[Run], tables: dict[str, pd.DataFrame], differ: Sequence[str]) -> None:

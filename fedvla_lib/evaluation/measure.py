@@ -41,16 +41,9 @@ class Measurement:
 
 
 def measure(
-    bundle: Bundle,
-    store: FrameStore,
-    config: Config,
-    *,
-    episode_ids: Sequence[int] | None = None,
-    seeds: Sequence[int] = (),
-    videos_dir: Path | None = None,
-    progress: bool = False,
-    jobs: int = 1,
-) -> Measurement:
+    bundle: Bundle, store: FrameStore, config: Config, *, episode_ids: Sequence[int] | None = None,
+    seeds: Sequence[int] = (), videos_dir: Path | None = None, progress: bool = False, jobs: int = 1,
+) -> Measurement:  # fmt: skip
     """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task and seed.
 
     Args:
@@ -72,9 +65,10 @@ def log_measurement(run: RunFolder, round_number: int, who: str, found: Measurem
 
 
 def log_rollouts(run: RunFolder, round_number: int, who: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Log an event for each rollout; paths of videos become relative to the run folder."""
+    """Log an event for each rollout; paths of videos become relative to the run folder, so that it can be moved."""
     for row in rows:
-        run.log(round_number, who, "rollout", {**row, "video": run.relative(row["video"])})
+        video = row["video"] and Path(row["video"]).relative_to(run.root).as_posix()
+        run.log(round_number, who, "rollout", {**row, "video": video})
 
 
 def is_validated(config: Config, round_number: int) -> bool:

@@ -19,11 +19,7 @@ DISTINCT = 8  # distinct values that the bootstrap of a mean needs
 
 
 def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
-    """Return the metrics.
-
-    Raises:
-        ValueError: one of them is not in `known`.
-    """
+    """Return the metrics; raise ValueError if one of them is not in `known`."""
     for metric in metrics or [""]:  # none is no choice either
         if metric not in known:
             raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(known)}")
@@ -31,11 +27,7 @@ def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
 
 
 def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Wilson score interval of a success rate (Wilson 1927), both ends in [0, 1].
-
-    Raises:
-        ValueError: no trials, or more successes than trials.
-    """
+    """Wilson score interval of a success rate (Wilson 1927), in [0, 1]; raise ValueError for impossible counts."""
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"successes={successes} of trials={trials}: give 0 <= successes <= trials, trials > 0")
     low, high = proportion_confint(successes, trials, alpha=1 - confidence, method="wilson")
@@ -51,6 +43,19 @@ def success_table(rows: pd.DataFrame, by: Sequence[str], confidence: float = CON
     return table
 
 
+def mean_with_interval(
+    values: np.ndarray, *, of_success: bool, seed: int, confidence: float = CONFIDENCE
+) -> dict[str, float]:
+    """Return n, value (the mean), low and high: `wilson` for outcomes, else `mean_interval`; NaN without values."""
+    if not len(values):
+        return {"n": 0, "value": np.nan, "low": np.nan, "high": np.nan}
+    if of_success:
+        low, high = wilson(int(values.sum()), len(values), confidence)
+    else:
+        low, high = mean_interval(values, seed=seed, confidence=confidence)
+    return {"n": len(values), "value": float(values.mean()), "low": low, "high": high}
+
+
 def success_difference(
     left: Sequence[bool], right: Sequence[bool], *, seed: int, confidence: float = CONFIDENCE
 ) -> dict[str, Any]:
@@ -64,14 +69,13 @@ def success_difference(
         McNemar's exact test (McNemar 1947).
     """
     left, right = np.asarray(left, bool), np.asarray(right, bool)
-    table = [[int((left & right).sum()), int((left & ~right).sum())],
-             [int((~left & right).sum()), int((~left & ~right).sum())]]  # fmt: skip
+    only_left, only_right = int((left & ~right).sum()), int((right & ~left).sum())  # all that McNemar's test counts
     low, high = mean_interval(left.astype(float) - right, seed=seed, confidence=confidence)
-    only_left, only_right = table[0][1], table[1][0]
+    p_value = float(mcnemar([[0, only_left], [only_right, 0]], exact=True).pvalue)
     return {
         "n": len(left), "difference": float(left.mean() - right.mean()), "low": low, "high": high,
         "visible": smallest_difference(len(left), (only_left + only_right) / len(left), confidence),
-        "only_left": only_left, "only_right": only_right, "p_value": float(mcnemar(table, exact=True).pvalue),
+        "only_left": only_left, "only_right": only_right, "p_value": p_value,
     }  # fmt: skip
 
 

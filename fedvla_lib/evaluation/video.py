@@ -59,11 +59,7 @@ def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
 
 
 def read_video(path: Path) -> np.ndarray:
-    """Decode an mp4: uint8 (T, H, W, 3).
-
-    Raises:
-        ValueError: the file cannot be decoded; the message names it.
-    """
+    """Decode an mp4: uint8 (T, H, W, 3); raise ValueError, which names the file, if it cannot be decoded."""
     av.logging.set_level(None)  # LeRobot's encoder leaves libav printing to stderr; the exception says what is wrong
     try:
         with av.open(str(path)) as container:

@@ -46,7 +46,13 @@ def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
 def _read(video: Path) -> dict[str, Any]:
     if not video.is_file():
         raise ValueError("the trajectory has no video")
-    trajectory = _trajectory(video.with_suffix(".npz"))
+    if not (path := video.with_suffix(".npz")).is_file():
+        raise ValueError("the video has no trajectory")
+    try:
+        with np.load(path) as arrays:
+            trajectory = {name: arrays[name] for name in ("actions", "success", "seed")}
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+        raise ValueError(f"its trajectory cannot be read: {error}") from error
     frames, steps = len(read_video(video)), len(trajectory["actions"])
     if frames != steps:
         raise ValueError(f"the video has {frames} frames, its trajectory {steps} steps")
@@ -59,27 +65,14 @@ def _read(video: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _trajectory(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise ValueError("the video has no trajectory")
-    try:
-        with np.load(path) as arrays:
-            return {name: arrays[name] for name in ("actions", "success", "seed")}
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
-        raise ValueError(f"its trajectory cannot be read: {error}") from error
-
-
 def trend_by_round(rows: pd.DataFrame, metric: str, *, seed: int = 0) -> pd.DataFrame:
     """Return a metric for each round: n, value, low, high (Wilson for success, else bootstrap over rollouts)."""
     lines = []
     for number, part in rows.groupby("round"):
-        each = part["success" if metric == "success_rate" else metric].dropna().to_numpy(float)
-        value, low, high = float(each.mean()) if len(each) else float("nan"), float("nan"), float("nan")
-        if metric == "success_rate":
-            low, high = statistics.wilson(int(each.sum()), len(each))
-        elif len(each):
-            low, high = statistics.mean_interval(each, seed=seed)
-        lines.append({"round": number, "metric": metric, "n": len(each), "value": value, "low": low, "high": high})
+        is_success = metric == "success_rate"
+        each = part["success" if is_success else metric].dropna().to_numpy(float)
+        measured = statistics.mean_with_interval(each, of_success=is_success, seed=seed)
+        lines.append({"round": number, "metric": metric, **measured})
     return pd.DataFrame(lines)
 
 

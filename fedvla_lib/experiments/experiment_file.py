@@ -80,7 +80,9 @@ def read_plan(file: Path) -> Plan:
     if unknown := sorted(set(content) - NAMES):
         raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
     _check_types(content, Path(file))
-    cells = [cell for cell in _cells(content, Path(file)) if _wanted(cell, content.get("only", []))]
+    cells, only = list(_cells(content, Path(file))), content.get("only", [])
+    if only:
+        cells = [c for c in cells if any(all(getattr(c, key) == rule[key] for key in rule) for rule in only)]
     return Plan(cells, rollout_seeds(content["rollouts"], first=content.get("first_rollout_seed", 2_000_000)))
 
 
@@ -118,7 +120,3 @@ def _cells(content: dict[str, Any], file: Path) -> Iterator[Cell]:
                     raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
                 settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
                 yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))
-
-
-def _wanted(cell: Cell, only: list[dict[str, Any]]) -> bool:
-    return not only or any(all(getattr(cell, key) == value for key, value in rule.items()) for rule in only)

@@ -8,7 +8,6 @@ code that determines them, so a change of either trains again.
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from fedvla_lib.policy import model, nano, prefix_cache
 from fedvla_lib.policy.training import TrainResult, local_train
 from fedvla_lib.provenance import code_digest
 
-CENTRALIZED = "centralized"
 STEPS_FILE = "steps.json"  # next to a cached model's weights: its gradient steps as counted while training
 
 
@@ -69,7 +67,7 @@ def base(config: Config) -> model.Bundle:
 
 def centralized(config: Config, progress: bool = True) -> model.Bundle:
     """Train on all clients' training episodes for `total_steps`, or load the cached model."""
-    return _cached(config, CENTRALIZED, lambda: _train(config, open_pooled(config), total_steps(config), progress))
+    return _trained_alone(config, None, progress)
 
 
 def local_only(config: Config, partition_id: int, progress: bool = True) -> model.Bundle:
@@ -77,8 +75,7 @@ def local_only(config: Config, partition_id: int, progress: bool = True) -> mode
 
     Normalisation uses the pooled statistics, as in the federation.
     """
-    name, steps = _local_name(partition_id), steps_per_client(config)
-    return _cached(config, name, lambda: _train(config, open_client(config, partition_id), steps, progress))
+    return _trained_alone(config, partition_id, progress)
 
 
 def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:
@@ -92,20 +89,11 @@ def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:
     Raises:
         ValueError: no model with these settings is cached.
     """
-    name = CENTRALIZED if partition_id is None else _local_name(partition_id)
-    file = _place(config, name) / STEPS_FILE
+    file = _folder(config, partition_id) / STEPS_FILE
     if not file.is_file():
+        name = _name(partition_id)
         raise ValueError(f"{name} has not been trained with these settings: train it before asking for its steps")
     return json.loads(file.read_text())
-
-
-def _local_name(partition_id: int) -> str:
-    return f"local-only-{partition_id}"
-
-
-def _train(config: Config, client: Client, steps: int, progress: bool) -> tuple[model.Bundle, TrainResult]:
-    bundle = base(config)
-    return bundle, train_alone(bundle, client, steps=steps, progress=progress)
 
 
 def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **options: Any) -> TrainResult:
@@ -114,23 +102,27 @@ def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **options: 
     return local_train(bundle, batches, client.config, steps=steps, **options)
 
 
-def _cached(config: Config, name: str, train: Callable[[], tuple[model.Bundle, TrainResult]]) -> model.Bundle:
-    """Load the method's model from the cache, or train and cache it."""
-    folder = _place(config, name)
+def _trained_alone(config: Config, partition_id: int | None, progress: bool) -> model.Bundle:
+    """Load the model of a client, or of all clients' data, from the cache, or train and cache it."""
+    folder = _folder(config, partition_id)
     with _lock(folder):
         if not folder.exists():
-            _save(folder, *train())
+            pooled = partition_id is None
+            client = open_pooled(config) if pooled else open_client(config, partition_id)
+            steps, bundle = total_steps(config) if pooled else steps_per_client(config), base(config)
+            result = train_alone(bundle, client, steps=steps, progress=progress)
+            with files.new_folder(folder) as draft:
+                model.write_policy(bundle, draft)
+                files.write_json(draft / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
     return model.load_policy(replace(config, base=str(folder)))
 
 
-def _save(folder: Path, bundle: model.Bundle, result: TrainResult) -> None:
-    with files.new_folder(folder) as draft:
-        model.write_policy(bundle, draft)
-        files.write_json(draft / STEPS_FILE, {"in_all": result.steps, "in_a_row": result.steps})
+def _name(partition_id: int | None) -> str:
+    return "centralized" if partition_id is None else f"local-only-{partition_id}"
 
 
-def _place(config: Config, name: str) -> Path:
-    return cache_dir() / "methods" / f"{name}-{_key(config)}"
+def _folder(config: Config, partition_id: int | None) -> Path:
+    return cache_dir() / "methods" / f"{_name(partition_id)}-{_key(config)}"
 
 
 def _lock(cached: Path) -> FileLock:

@@ -29,10 +29,9 @@ from fedvla_lib.policy.model import Bundle
 # First rollout seed of reports. Not used by chapters; comparison.toml and normalisation.toml share it. Trials make no
 # rollouts, so these rollouts select nothing.
 ROLLOUTS_FROM = 3_000_000
-LOCAL_STEPS = (1, 2, 5, 10, 20)
+LOCAL_STEPS, SHARES = (1, 2, 5, 10, 20), (0.1, 0.2, 0.4, 1.0)
 # A client raises if its loss is not finite, and the server stops when too few replies are usable.
 DIVERGED = (FloatingPointError, TooFewReplies)
-SHARES = (0.1, 0.2, 0.4, 1.0)
 
 
 def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, Any]:
@@ -60,14 +59,16 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
             "select by and half to report on"
         )
     study = _run_trials(config, trials, out)
-    ended = {"status": "completed", "code": methods.trained_by()}
     result = {
         "budget": methods.total_steps(config),
-        "trials": [_line(trial) for trial in study.trials if trial.state.is_finished()],
+        "trials": [
+            {"number": trial.number, **trial.params, "selection_loss": trial.value}
+            for trial in study.trials if trial.state.is_finished()
+        ],
         "winner": study.best_params, "selection_loss": study.best_value,
         "start": report(config, rollouts), "best": report(suggest(study.best_trial, config), rollouts),
         "first_rollout_seed": ROLLOUTS_FROM, "config": asdict(given),
-        "stamp": provenance.first_stamp(given, "search") | ended,
+        "stamp": provenance.first_stamp(given, "search") | {"status": "completed", "code": methods.trained_by()},
     }  # fmt: skip
     write_json(out / "search.json", result)
     return result
@@ -124,15 +125,10 @@ def _open(config: Config, out: Path) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = JournalStorage(JournalFileBackend(str(out / "trials.log")))
     study = optuna.create_study(storage=storage, study_name="search", load_if_exists=True)
-    study.sampler = optuna.samplers.TPESampler(
-        seed=config.seed + len(study.trials)
-    )  # a resumed search must not repeat its draws
+    # A resumed search must not repeat its draws.
+    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))
     settings = json.dumps(asdict(replace(config, data="", num_threads=0)))
     if study.user_attrs.get("settings", settings) != settings:
         raise ValueError(f"{out} holds a search with other settings: give another folder")
     study.set_user_attr("settings", settings)
     return study
-
-
-def _line(trial: Any) -> dict[str, Any]:
-    return {"number": trial.number, **trial.params, "selection_loss": trial.value}

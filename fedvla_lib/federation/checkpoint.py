@@ -41,11 +41,7 @@ class Checkpoint:
 
 
 def save(root: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint to the run folder atomically, and remove all but the last two.
-
-    Raises:
-        OSError: it cannot be written; the message names the file.
-    """
+    """Write a checkpoint atomically, and remove all but the last two; raise OSError, naming the file, if that fails."""
     folder = root / "checkpoints" / f"round_{checkpoint.round}"
     with new_folder(folder, replace=True) as draft:
         for part in PARTS:
@@ -59,11 +55,7 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(root: Path) -> Checkpoint:
-    """Return the last intact checkpoint of a run folder, and log a warning for each damaged one after it.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return a run's last intact checkpoint, warning of each damaged one after it; raise ValueError if none is left."""
     if not (rounds := sorted(_rounds(root), reverse=True)):
         raise ValueError(f"{root} has no checkpoint: no round was completed; start a new run")
     for number in rounds:

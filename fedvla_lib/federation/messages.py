@@ -22,11 +22,7 @@ from fedvla_lib.federation.quantisation import check_encoded, decode
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest
 from fedvla_lib.robot.spec import JOINT_NAMES
 
-ARRAYS = "arrays"
-CONTROL = "control"
-CONFIG = "config"
-METRICS = "metrics"
-NOTE = "note"
+ARRAYS, CONTROL, CONFIG, METRICS, NOTE = "arrays", "control", "config", "metrics", "note"  # records
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
@@ -51,22 +47,23 @@ def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
 
 
 def unpack_arrays(record: ArrayRecord) -> Arrays:
-    """Return the arrays of a record by name.
-
-    Raises:
-        ParameterError: the bytes of an array cannot be decoded.
-    """
-    return {name: _decode(name, array) for name, array in record.items()}
+    """Return the arrays of a record by name; raise ParameterError if the bytes of one cannot be decoded."""
+    arrays = {}
+    for name, array in record.items():
+        try:
+            arrays[name] = _numbers(name, array).copy()  # of its own, writable memory
+        except ParameterError:
+            raise
+        # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
+        except Exception as error:
+            raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
+    return arrays
 
 
 def checked_arrays(
-    content: RecordDict,
-    digest_in: str,
-    shapes: Shapes,
-    record: str = ARRAYS,
-    also: tuple[str, ...] = (),
-    exchange: str = "float32",
-) -> Arrays:
+    content: RecordDict, digest_in: str, shapes: Shapes, record: str = ARRAYS,
+    also: tuple[str, ...] = (), exchange: str = "float32",
+) -> Arrays:  # fmt: skip
     """Unpack `record` and check names, shapes, finiteness and the SHA-256 in record `digest_in`.
 
     Args:
@@ -118,8 +115,7 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     """Return the rollouts of an evaluation reply.
 
     Raises:
-        ParameterError: they cannot be read, or a file name is not a rollout's, so that a client cannot choose where the
-            server writes.
+        ParameterError: they cannot be read, or a file name is not a rollout's: clients must not choose where we write.
     """
     note = content.config_records.get(NOTE, {})
     try:
@@ -141,17 +137,6 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
 def make_note(**values: Any) -> ConfigRecord:
     """Return the client's note; underscores in keywords become dashes."""
     return ConfigRecord({key.replace("_", "-"): value for key, value in values.items()})
-
-
-def _decode(name: str, array: Array) -> np.ndarray:
-    """Return one array of a record after checking that its bytes are a .npy of numbers of the declared size."""
-    try:
-        return _numbers(name, array).copy()  # of its own, writable memory
-    except ParameterError:
-        raise
-    # NumPy parses the header as Python, which can fail in many ways; none of them may end the run.
-    except Exception as error:
-        raise ParameterError("dtype", f"array {name!r} cannot be decoded: {error}") from error
 
 
 def _numbers(name: str, array: Array) -> np.ndarray:

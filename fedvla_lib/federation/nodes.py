@@ -65,11 +65,7 @@ def client_name(partition_id: int) -> str:
 
 
 def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
-    """Return the ids of all connected nodes once there are `num_clients`.
-
-    Raises:
-        TooFewReplies: fewer have connected when the time is up.
-    """
+    """Return the ids of all connected nodes once there are `num_clients`; raise TooFewReplies when the time is up."""
     deadline = time.monotonic() + timeout_s
     while len(nodes := sorted(grid.get_node_ids())) < num_clients:
         if time.monotonic() > deadline:
@@ -90,17 +86,16 @@ def introduce_nodes(
     """
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
     replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
-    introductions: dict[int, Introduction] = {}
+    found: dict[int, Introduction] = {}
     for reply in replies:
+        node = reply.metadata.src_node_id
         try:
-            introductions[reply.metadata.src_node_id] = _introduction(reply, introductions.values())
+            found[node] = _introduction(reply, {other.partition_id for other in found.values()})
         except ParameterError as error:
-            values = {"to": "query", "reason": error.kind, "detail": str(error)}
-            report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
-    ordered = dict(sorted(introductions.items(), key=lambda item: item[1].partition_id))
-    partitions = {node: one.partition_id for node, one in ordered.items()}
-    examples = {node: one.num_examples for node, one in ordered.items()}
-    return Roster(partitions, examples), list(ordered.values())
+            report(0, f"node_{node}", "rejected", {"to": "query", "reason": error.kind, "detail": str(error)})
+    ordered = sorted(found, key=lambda node: found[node].partition_id)
+    roster = Roster({n: found[n].partition_id for n in ordered}, {n: found[n].num_examples for n in ordered})
+    return roster, [found[node] for node in ordered]
 
 
 def answered(reply: Message | None) -> Message:
@@ -112,10 +107,9 @@ def answered(reply: Message | None) -> Message:
     return reply
 
 
-def _introduction(reply: Message, others: Iterable[Introduction]) -> Introduction:
+def _introduction(reply: Message, taken: set[int]) -> Introduction:
     note = answered(reply).content.config_records.get(NOTE, {})
     partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
-    taken = {other.partition_id for other in others}
     if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
         raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
     if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:

@@ -39,7 +39,7 @@ class PolicyActor:
         due = [(actor, observed) for actor, observed in zip(actors, observations, strict=True) if not actor._queue]
         if due:
             bundle = due[0][0].bundle
-            batch = _joined([_as_batch(observed, actor._instruction) for actor, observed in due])
+            batch = _as_batch([observed for _, observed in due], [actor._instruction for actor, _ in due])
             noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in due])
             for (actor, _), chunk in zip(due, _denoise(bundle, batch, noise), strict=True):
                 actor._queue.extend(chunk[: bundle.policy.config.n_action_steps].numpy())
@@ -63,16 +63,9 @@ def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torc
     return bundle.postprocess(chunk)
 
 
-def _joined(batches: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Concatenate raw batches."""
-    tensors = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0] if key != "task"}
-    return tensors | {"task": [text for batch in batches for text in batch["task"]]}
-
-
-def _as_batch(observation: Observation, instruction: str) -> dict[str, Any]:
-    """Convert a Gymnasium observation to a raw batch of size 1."""
-    batch: dict[str, Any] = {"task": [instruction]}
-    for camera, pixels in observation["pixels"].items():
-        batch[image_key(camera)] = to_float(np.ascontiguousarray(pixels)[None])  # (1, 3, H, W)
-    batch[STATE_KEY] = torch.from_numpy(np.asarray(observation["agent_pos"], np.float32))[None]  # (1, 6)
-    return batch
+def _as_batch(observations: Sequence[Observation], instructions: list[str]) -> dict[str, Any]:
+    """Convert B Gymnasium observations to a raw batch."""
+    pixels = [observation["pixels"] for observation in observations]
+    images = {image_key(camera): to_float(np.stack([each[camera] for each in pixels])) for camera in pixels[0]}
+    states = np.stack([np.asarray(observation["agent_pos"], np.float32) for observation in observations])
+    return {**images, STATE_KEY: torch.from_numpy(states), "task": instructions}  # (B, 3, H, W), (B, 6)

@@ -20,9 +20,7 @@ from fedvla_lib.files import cache_dir, new_folder
 PACKAGE = "fedvla-lib"
 NANO, NANO_RANDOM = "nano", "nano-random"  # values of Config.base
 WEIGHTS_FILE = "model.safetensors"
-WIDTH = 128
-TEXT_LAYERS = 4
-VISION_LAYERS = 3
+WIDTH, TEXT_LAYERS, VISION_LAYERS = 128, 4, 3
 PATCHES_PER_SIDE = 8  # the patch size scales with the image size, so compute is constant
 CONNECTOR_SCALE = 2  # pixel shuffle merges 2 x 2 patches into one token: 16 tokens per camera
 VOCAB_SIZE = 384
@@ -39,11 +37,7 @@ CORPUS = [
 
 
 def ensure_nano(image_size: int) -> Path:
-    """Return the cached folder of the nano backbone for `image_size` pixels; write it if it does not exist.
-
-    Raises:
-        ValueError: `image_size` is not a multiple of the number of patches per side.
-    """
+    """Return the cached folder of the nano backbone for `image_size` pixels, written if missing; see `write_nano`."""
     folder = cache_dir() / f"nano-vlm-{image_size}"
     if not (folder / "config.json").exists():
         with new_folder(folder) as draft:
@@ -52,29 +46,25 @@ def ensure_nano(image_size: int) -> Path:
 
 
 def write_nano(folder: Path, image_size: int) -> None:
-    """Write config, tokenizer and processors of the nano backbone into `folder`."""
+    """Write config, tokenizer and processors of the nano backbone; ValueError unless patches fill `image_size`."""
     if image_size % PATCHES_PER_SIDE:
         raise ValueError(f"image_size={image_size} is not usable: give a multiple of {PATCHES_PER_SIDE} pixels")
     tokenizer = _tokenizer()
     _config(image_size, tokenizer).save_pretrained(folder)
-    size = {"longest_edge": image_size}
-    SmolVLMProcessor(
-        image_processor=SmolVLMImageProcessor(size=size, max_image_size=size),
-        tokenizer=tokenizer,
-        video_processor=SmolVLMVideoProcessor(size=size, max_image_size=size),
-        image_seq_len=(PATCHES_PER_SIDE // CONNECTOR_SCALE) ** 2,
-    ).save_pretrained(folder)
+    sizes = dict.fromkeys(("size", "max_image_size"), {"longest_edge": image_size})
+    images, video = SmolVLMImageProcessor(**sizes), SmolVLMVideoProcessor(**sizes)
+    tokens = (PATCHES_PER_SIDE // CONNECTOR_SCALE) ** 2
+    SmolVLMProcessor(images, tokenizer, video_processor=video, image_seq_len=tokens).save_pretrained(folder)
 
 
 def _config(image_size: int, tokenizer: PreTrainedTokenizerFast) -> SmolVLMConfig:
-    vision = {
-        "hidden_size": WIDTH, "intermediate_size": 2 * WIDTH, "num_hidden_layers": VISION_LAYERS,
-        "num_attention_heads": 4, "image_size": image_size, "patch_size": image_size // PATCHES_PER_SIDE,
+    widths = {"hidden_size": WIDTH, "intermediate_size": 2 * WIDTH, "num_attention_heads": 4}
+    vision = widths | {
+        "num_hidden_layers": VISION_LAYERS, "image_size": image_size, "patch_size": image_size // PATCHES_PER_SIDE,
     }  # fmt: skip
-    text = {
-        "model_type": "llama", "hidden_size": WIDTH, "intermediate_size": 2 * WIDTH, "num_hidden_layers": TEXT_LAYERS,
-        "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": WIDTH // 4, "vocab_size": len(tokenizer),
-        "max_position_embeddings": 512, "pad_token_id": tokenizer.pad_token_id,
+    text = widths | {
+        "model_type": "llama", "num_hidden_layers": TEXT_LAYERS, "num_key_value_heads": 2, "head_dim": WIDTH // 4,
+        "vocab_size": len(tokenizer), "max_position_embeddings": 512, "pad_token_id": tokenizer.pad_token_id,
     }  # fmt: skip
     return SmolVLMConfig(
         vision_config=vision, text_config=text, scale_factor=CONNECTOR_SCALE, pad_token_id=tokenizer.pad_token_id,
@@ -101,12 +91,9 @@ def _tokenizer() -> PreTrainedTokenizerFast:
 
 
 def nano_base() -> Path:
-    """Return the folder of the pretrained nano model.
+    """Return the folder of the pretrained nano model; raise ValueError if it is in neither of two places.
 
     Flower's app bundle contains no weights; code running from a bundle finds them in the installed package.
-
-    Raises:
-        ValueError: the weights are in neither place.
     """
     for package in (Path(__file__).parents[1], *_installed()):
         if (package / "nano_base" / WEIGHTS_FILE).is_file():

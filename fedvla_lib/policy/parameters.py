@@ -30,12 +30,8 @@ def trainable(policy: torch.nn.Module) -> dict[str, torch.nn.Parameter]:
 
 
 def trainable_arrays(policy: torch.nn.Module) -> Arrays:
-    """Return copies of all trainable parameters by name, float32, in the policy's order.
-
-    Raises:
-        ValueError: the policy has no trainable parameter.
-    """
-    arrays = {name: _to_numpy(parameter) for name, parameter in trainable(policy).items()}
+    """Return copies of all trainable parameters by name, float32, in the policy's order; ValueError without any."""
+    arrays = {name: p.detach().to("cpu", torch.float32, copy=True).numpy() for name, p in trainable(policy).items()}
     if not arrays:
         raise ValueError("the policy has no trainable parameter: unfreeze a part of it (train-expert-only, base)")
     return arrays
@@ -83,39 +79,22 @@ def check_arrays(
     Raises:
         ParameterError: the first error found, with the name of the array and what was expected.
     """
-    _check_names(set(arrays), set(reference_shapes))
+    differences = {"missing": set(reference_shapes) - set(arrays), "unknown": set(arrays) - set(reference_shapes)}
+    if parts := [f"{len(wrong)} {word} (first {min(wrong)!r})" for word, wrong in differences.items() if wrong]:
+        raise ParameterError("names", f"{len(reference_shapes)} arrays expected: {' and '.join(parts)}")
     for name, shape in reference_shapes.items():
-        _check_one(name, arrays[name], shape)
+        array = arrays[name]
+        if array.dtype != np.float32:
+            raise ParameterError("dtype", f"array {name!r} has dtype {array.dtype}, expected float32")
+        if array.shape != shape:
+            raise ParameterError("shape", f"array {name!r} has shape {array.shape}, expected {shape}")
+        if bad := int((~np.isfinite(array)).sum()):
+            raise ParameterError("non-finite", f"array {name!r} has {bad} non-finite values")
     if expected_digest is not None:
         check_digest(arrays, expected_digest)
 
 
 def check_digest(arrays: Mapping[str, np.ndarray], expected_digest: str) -> None:
-    """Check that the arrays match the digest sent with them.
-
-    Raises:
-        ParameterError: they do not.
-    """
+    """Raise ParameterError unless the arrays match the digest sent with them."""
     if (actual := digest(arrays)) != expected_digest:
         raise ParameterError("hash", f"SHA-256 is {actual[:12]}..., expected {expected_digest[:12]}...")
-
-
-def _check_names(names: set[str], expected: set[str]) -> None:
-    errors = {"missing": sorted(expected - names), "unknown": sorted(names - expected)}
-    parts = [f"{len(wrong)} {word} (first {wrong[0]!r})" for word, wrong in errors.items() if wrong]
-    if parts:
-        raise ParameterError("names", f"{len(expected)} arrays expected: {' and '.join(parts)}")
-
-
-def _check_one(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    if array.dtype != np.float32:
-        raise ParameterError("dtype", f"array {name!r} has dtype {array.dtype}, expected float32")
-    if tuple(array.shape) != shape:
-        raise ParameterError("shape", f"array {name!r} has shape {tuple(array.shape)}, expected {shape}")
-    if not np.isfinite(array).all():
-        bad = int(array.size - np.isfinite(array).sum())
-        raise ParameterError("non-finite", f"array {name!r} has {bad} non-finite values")
-
-
-def _to_numpy(parameter: torch.nn.Parameter) -> np.ndarray:
-    return parameter.detach().to("cpu", torch.float32, copy=True).numpy()

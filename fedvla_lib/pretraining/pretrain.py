@@ -61,7 +61,9 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     began, config, work = time.perf_counter(), settings(recipe), _work_folder(recipe)
     stamp = first_stamp(config, "pretrain")
-    store = _record(recipe, work / "recording", progress)
+    drawn = {"image_size": recipe.image_size, "seed": recipe.seed, "jitter": recipe.jitter, "progress": progress}
+    recording = record.record(list(PRETRAINING_TASKS), recipe.episodes_per_task, work / "recording", **drawn)
+    store = frame_store.open_store(recording, image_size=recipe.image_size)
     episodes = list(store.episodes.episode_id)
     stats = normalisation.episode_stats(store, episodes)
     grounded, grounding = ground(recipe, stats, work, progress)
@@ -84,14 +86,6 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         _make_backbone_relative(draft, bundle.policy.config.vlm_model_name)
         write_json(draft / CARD_FILE, report)
     return out
-
-
-def _record(recipe: Recipe, folder: Path, progress: bool) -> frame_store.FrameStore:
-    recording = record.record(
-        list(PRETRAINING_TASKS), recipe.episodes_per_task, folder, image_size=recipe.image_size, seed=recipe.seed,
-        jitter=recipe.jitter, progress=progress,
-    )  # fmt: skip
-    return frame_store.open_store(recording, image_size=recipe.image_size)
 
 
 def ground(
@@ -174,11 +168,7 @@ def _work_folder(recipe: Recipe) -> Path:
 
 
 def read_account(base: Path | None = None) -> dict[str, Any]:
-    """Return the report saved with a base; default the base in this package.
-
-    Raises:
-        ValueError: the folder has no report.
-    """
+    """Return the report saved with a base, by default the one in this package; raise ValueError if it has none."""
     path = (base or nano.nano_base()) / CARD_FILE
     if not path.is_file():
         raise ValueError(f"{path.parent} has no {CARD_FILE}: it was not made by fedvla pretrain")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.format import open_memmap
 from tqdm.auto import tqdm
 
 from fedvla_lib.files import new_folder
@@ -53,11 +54,8 @@ def draw_scenes(
 
 
 def _draw(folder: Path, count: int, size: int, rng: np.random.Generator, jitter: float, progress: bool) -> None:
-    shape = (count, size, size, 3)
-    images = {
-        camera: np.lib.format.open_memmap(folder / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
-        for camera in CAMERAS
-    }
+    files = {camera: folder / f"{camera}.npy" for camera in CAMERAS}
+    images = {camera: open_memmap(file, "w+", np.uint8, (count, size, size, 3)) for camera, file in files.items()}
     places_m = np.full((count, len(OBJECTS), 2), np.nan, np.float32)
     shares = np.full((count, len(CAMERAS), len(OBJECTS), 2), np.nan, np.float32)
     with ExitStack() as stack:

@@ -6,6 +6,7 @@ and the joint positions.
 """
 
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -26,29 +27,26 @@ FORK_GAP_M = 0.040  # distance from the cube's centre at which the fork comes do
 FORK_CONTACT_M = 0.022  # distance while pushing
 GRASP_HEIGHT_M = 0.016  # heights of the grasp point above the table
 STACK_HEIGHT_M = GRASP_HEIGHT_M + 2 * CUBE_HALF_M
-PUSH_HEIGHT_M = 0.018
-HOVER_HEIGHT_M = 0.075
-CARRY_HEIGHT_M = 0.080
+PUSH_HEIGHT_M, HOVER_HEIGHT_M, CARRY_HEIGHT_M = 0.018, 0.075, 0.080
+REACH_HEIGHT_M, POINT_HEIGHT_M, LIFT_HEIGHT_M = 0.048, 0.055, 0.095
 RISE_M = 0.059  # distance the hand rises after releasing the cube
-REACH_HEIGHT_M = 0.048
-POINT_HEIGHT_M = 0.055
 DRAG_HEIGHT_M = 0.017  # the cube stays on the table
 PULL_M = 0.032
 DRAG_RAD, NUDGE_RAD = np.deg2rad(17.0), np.deg2rad(16.0)
-LIFT_HEIGHT_M = 0.095
 SIDESTEP_M = 0.009  # offset of the open jaws towards the fixed jaw, so that neither touches the cube on the way down
 CLOSE_STEPS = OPEN_STEPS = 4
 MIN_STEPS = 4
 SPEED_M = 0.011  # mean distance per control step
 SOLVER_STEPS = 60  # maximum inverse kinematics iterations per control step
 SOLVER_TOLERANCE_RAD = 2e-4  # stop when the update is smaller
+Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Waypoint:
     """Target of the grasp point, `steps` control steps after the previous waypoint."""
 
-    position_m: tuple[float, float, float]
+    position_m: Point
     yaw_rad: float  # rotation of the gripper about the vertical; at 0 the jaws close along y
     gripper: float  # 0-100
     steps: int
@@ -77,13 +75,10 @@ class Expert:
 
 def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
     """Run the expert without cameras on each seed; rows with task, seed, success and steps."""
-    env = So100Env(task, cameras=(), render_mode=None)
-    expert, rows = Expert(), []
-    for seed in tqdm(seeds, desc=f"expert {task}", disable=None):
-        episode = run_episode(env, expert, seed)
-        rows.append({"task": task, "seed": seed, "success": episode.success, "steps": episode.num_frames})
-    env.close()
-    return rows
+    expert = Expert()
+    with closing(So100Env(task, cameras=(), render_mode=None)) as env:
+        episodes = (run_episode(env, expert, seed) for seed in tqdm(seeds, desc=f"expert {task}", disable=None))
+        return [{"task": task, "seed": e.seed, "success": e.success, "steps": e.num_frames} for e in episodes]
 
 
 class _Arm:
@@ -106,7 +101,10 @@ class _Arm:
 
     def solve(self, target: Waypoint) -> np.ndarray:
         """Return joint targets for the grasp point at `target`, float32 (6,), LeRobot units."""
-        self._task.set_target(_pose(target))
+        across, up = np.array([-np.sin(target.yaw_rad), np.cos(target.yaw_rad), 0.0]), np.array([0.0, 0.0, 1.0])
+        # Gripper down: the site's y axis points up, its x axis runs across the jaws.
+        rotation = mink.SO3.from_matrix(np.column_stack([across, up, np.cross(across, up)]))
+        self._task.set_target(mink.SE3.from_rotation_and_translation(rotation, np.array(target.position_m)))
         for _ in range(SOLVER_STEPS):
             velocity = mink.solve_ik(self._configuration, [self._task], 1.0, "daqp", damping=1e-6, limits=self._limits)
             self._configuration.integrate_inplace(velocity, 1.0)
@@ -117,34 +115,22 @@ class _Arm:
         return joints
 
 
-def _pose(target: Waypoint) -> mink.SE3:
-    """Gripper down: the site's y axis points up, its x axis runs across the jaws."""
-    across = np.array([-np.sin(target.yaw_rad), np.cos(target.yaw_rad), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    rotation = np.column_stack([across, up, np.cross(across, up)])
-    return mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotation), np.array(target.position_m))
-
-
 def _interpolate(start: Waypoint, plan: list[Waypoint]) -> list[Waypoint]:
     """Return one waypoint per control step, along straight lines with smooth acceleration and braking."""
-    return [
-        _between(begin, end, _smooth(step / end.steps))
-        for begin, end in pairwise([start, *plan])
-        for step in range(1, end.steps + 1)
-    ]
-
-
-def _between(begin: Waypoint, end: Waypoint, progress: float) -> Waypoint:
-    position_m = (1 - progress) * np.array(begin.position_m) + progress * np.array(end.position_m)
-    yaw_rad = (1 - progress) * begin.yaw_rad + progress * end.yaw_rad
-    return Waypoint(tuple(position_m), yaw_rad, (1 - progress) * begin.gripper + progress * end.gripper, 1)
+    path = []
+    for begin, end in pairwise([start, *plan]):
+        before, after = (np.array([*one.position_m, one.yaw_rad, one.gripper]) for one in (begin, end))
+        for progress in (_smooth(step / end.steps) for step in range(1, end.steps + 1)):
+            *position_m, yaw_rad, gripper = (1 - progress) * before + progress * after
+            path.append(Waypoint(tuple(position_m), yaw_rad, gripper, 1))
+    return path
 
 
 def _smooth(progress: float) -> float:
     return progress * progress * (3 - 2 * progress)
 
 
-def _move(begin: Waypoint, position_m: tuple[float, float, float], yaw_rad: float, gripper: float) -> Waypoint:
+def _move(begin: Waypoint, position_m: Point, yaw_rad: float, gripper: float) -> Waypoint:
     """Return a waypoint whose number of steps follows from the distance."""
     distance_m = float(np.linalg.norm(np.subtract(position_m, begin.position_m)))
     return Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M)))
@@ -166,12 +152,13 @@ def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
 def _carry(start: Waypoint, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> list[Waypoint]:
     """Grasp the cube, carry it along an arc around the base, set it down with the hand at `height_m`, release, rise."""
     path = _grasp(start, cube)
-    path.append(_move(path[-1], (*cube.xy_m, CARRY_HEIGHT_M), path[-1].yaw_rad, CLOSED))
+    path.append(_move(path[-1], (*cube.xy_m, CARRY_HEIGHT_M), cube.yaw_rad, CLOSED))
     path += _arc(path[-1], to_xy_m, CARRY_HEIGHT_M, CLOSED)
-    path.append(_move(path[-1], (*to_xy_m, height_m), path[-1].yaw_rad, CLOSED))
-    around = _sidestep(*to_xy_m, path[-1].yaw_rad)
-    path.append(Waypoint((*around, height_m), path[-1].yaw_rad, OPEN, OPEN_STEPS))
-    return [*path, _move(path[-1], (*around, height_m + RISE_M), path[-1].yaw_rad, OPEN)]
+    yaw_rad = path[-1].yaw_rad
+    path.append(_move(path[-1], (*to_xy_m, height_m), yaw_rad, CLOSED))
+    around = _sidestep(*to_xy_m, yaw_rad)
+    path.append(Waypoint((*around, height_m), yaw_rad, OPEN, OPEN_STEPS))
+    return [*path, _move(path[-1], (*around, height_m + RISE_M), yaw_rad, OPEN)]
 
 
 def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> list[Waypoint]:
@@ -187,9 +174,9 @@ def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> 
     return [hover, down, *_arc(down, end, PUSH_HEIGHT_M, FORK)]
 
 
-def _lift_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    path = _grasp(start, layout.cubes[0])
-    return [*path, _move(path[-1], (*layout.cube_xy_m, LIFT_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+def _grasp_and_move(start: Waypoint, cube: Cube, to_m: Point, height_m: float = GRASP_HEIGHT_M) -> list[Waypoint]:
+    path = _grasp(start, cube, height_m)
+    return [*path, _move(path[-1], to_m, cube.yaw_rad, CLOSED)]
 
 
 def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
@@ -199,26 +186,25 @@ def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     return path
 
 
-def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
-
-
 def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
     path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
     return path + _arc(path[-1], cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
 
 
 def _pull_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
-    nearer = cartesian(radius_m - PULL_M, bearing_rad)
-    return [*path, _move(path[-1], (*nearer, DRAG_HEIGHT_M), path[-1].yaw_rad, CLOSED)]
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
+    nearer_m = (*cartesian(radius_m - PULL_M, bearing_rad), DRAG_HEIGHT_M)
+    return _grasp_and_move(start, layout.cubes[0], nearer_m, DRAG_HEIGHT_M)
 
 
 def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    radius_m, bearing_rad = _polar(*layout.cube_xy_m)
+    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
     return _sweep(start, layout.cubes[0], radius_m, bearing_rad - NUDGE_RAD)
+
+
+def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
+    return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
 
 
 def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
@@ -242,13 +228,14 @@ def _polar(x: float, y: float) -> tuple[float, float]:
 
 
 PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
-    "lift": _lift_plan,
+    "lift": lambda layout, start: _grasp_and_move(start, layout.cubes[0], (*layout.cubes[0].xy_m, LIFT_HEIGHT_M)),
     "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M),
     "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m)),
     "stack": lambda layout, start: _carry(start, layout.cubes[0], layout.cubes[1].xy_m, STACK_HEIGHT_M),
     "sort": _sort_plan,
-    "reach": lambda layout, start: [_move(start, (*layout.cube_xy_m, REACH_HEIGHT_M), layout.cube_yaw_rad, OPEN)],
+    "reach": lambda layout, start: [
+        _move(start, (*layout.cubes[0].xy_m, REACH_HEIGHT_M), layout.cubes[0].yaw_rad, OPEN)],
     "grip": lambda layout, start: _grasp(start, layout.cubes[0]),
-    "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan, "point_square": _point_plan,
-    "point_circle": _point_plan,
+    "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan,
+    "point_square": _point_plan, "point_circle": _point_plan,
 }  # fmt: skip

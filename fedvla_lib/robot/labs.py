@@ -50,16 +50,12 @@ def draw_lab(name: str, rng: np.random.Generator, spread: float = 1.0, offsets: 
         offsets: whether to draw calibration offsets too.
     """
     offset_deg = spread * rng.normal(0, OFFSET_DEG, NUM_JOINTS - 1)
+    shifts = (spread * rng.normal(0, sigma_m, (len(CAMERAS), 3)) for sigma_m in (CAMERA_SHIFT_M, LOOK_SHIFT_M))
+    camera_shift_m, look_shift_m = (tuple(map(tuple, shift_m.tolist())) for shift_m in shifts)
     return Lab(
-        name,
-        camera_shift_m=_rows(spread * rng.normal(0, CAMERA_SHIFT_M, (len(CAMERAS), 3))),
-        look_shift_m=_rows(spread * rng.normal(0, LOOK_SHIFT_M, (len(CAMERAS), 3))),
+        name, camera_shift_m, look_shift_m,
         brightness=float(1 + spread * (rng.uniform(*BRIGHTNESS) - 1)),
         table_change=tuple((spread * rng.uniform(-TABLE_CHANGE, TABLE_CHANGE, 3)).tolist()),
         paint_change=tuple((spread * rng.uniform(-PAINT_CHANGE, PAINT_CHANGE, 3)).tolist()),
         joint_offset_deg=tuple((offset_deg if offsets else 0 * offset_deg).tolist()),
-    )
-
-
-def _rows(values: np.ndarray) -> tuple[Vector, ...]:
-    return tuple(map(tuple, values.tolist()))
+    )  # fmt: skip

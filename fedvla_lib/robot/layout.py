@@ -3,8 +3,9 @@
 Lengths are metres in the world frame of `tasks`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, starmap
 
 import numpy as np
 
@@ -56,16 +57,6 @@ class Layout:
         return self.cubes[0].color
 
     @property
-    def cube_xy_m(self) -> tuple[float, float]:
-        """Centre of the first cube."""
-        return self.cubes[0].xy_m
-
-    @property
-    def cube_yaw_rad(self) -> float:
-        """Yaw of the first cube."""
-        return self.cubes[0].yaw_rad
-
-    @property
     def zone_xy_m(self) -> tuple[float, float] | None:
         """Centre of the first zone; None without a zone."""
         return self.zones_xy_m[0] if self.zones_xy_m else None
@@ -76,28 +67,25 @@ CUBES_APART_M = 0.058  # minimum distance between cube centres, so that the open
 ZONES_APART_M = 0.10
 
 
-def check_color(color: str) -> str:
-    """Return `color`; raise ValueError listing the valid colours if it is unknown."""
-    if color not in COLORS:
-        raise ValueError(f"unknown colour {color!r}: choose one of {', '.join(COLORS)}")
-    return color
+def draw_cubes(regions: Sequence[Region], colors: Sequence[str], rng: np.random.Generator) -> tuple[Cube, ...]:
+    """Draw a cube in each region, in the first of these colours."""
+    points = _draw_apart(regions, CUBES_APART_M, rng)
+    turns_rad = [rng.uniform(-MAX_CUBE_YAW_RAD, MAX_CUBE_YAW_RAD) for _ in points]
+    drawn = zip(colors, points, turns_rad, strict=False)  # there may be more colours
+    return tuple(Cube(color, cartesian(*point), float(point[1] + turn_rad)) for color, point, turn_rad in drawn)
 
 
-Point = tuple[tuple[float, float], float]  # x and y in metres, bearing in radians
+def draw_zones(zones: Sequence[Patch], rng: np.random.Generator) -> tuple[tuple[float, float], ...]:
+    """Draw the centre of each zone, x and y in metres."""
+    return tuple(cartesian(*point) for point in _draw_apart([zone.region for zone in zones], ZONES_APART_M, rng))
 
 
-def draw_apart(regions: list[Region], apart_m: float, rng: np.random.Generator) -> list[Point]:
-    """Draw one point in each region; redraw all of them until every two are at least `apart_m` apart."""
+def _draw_apart(regions: Sequence[Region], apart_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Draw radius and bearing in each region; redraw all of them until every two are at least `apart_m` apart."""
     while True:
-        points = [_draw_point(region, rng) for region in regions]
-        if all(np.linalg.norm(np.subtract(a[0], b[0])) >= apart_m for a, b in combinations(points, 2)):
+        points = [(rng.uniform(*r.radius_m), np.deg2rad(rng.uniform(*r.bearing_deg))) for r in regions]
+        if all(np.linalg.norm(np.subtract(a, b)) >= apart_m for a, b in combinations(starmap(cartesian, points), 2)):
             return points
-
-
-def _draw_point(region: Region, rng: np.random.Generator) -> Point:
-    radius_m = rng.uniform(*region.radius_m)
-    bearing_rad = np.deg2rad(rng.uniform(*region.bearing_deg))
-    return cartesian(radius_m, bearing_rad), float(bearing_rad)
 
 
 def cartesian(radius_m: float, bearing_rad: float) -> tuple[float, float]:

@@ -25,11 +25,7 @@ __path__: list[str] = []  # LeRobot's plugin loader looks for submodules and fai
 @EnvConfig.register_subclass("so100_sim")
 @dataclass
 class So100SimConfig(EnvConfig):
-    """LeRobot's configuration of `So100Env`: two cameras, the joint state, and the instruction as task description.
-
-    Raises:
-        ValueError: unknown task; the message lists the valid ones.
-    """
+    """LeRobot's configuration of `So100Env`: two cameras, joint state, instruction; ValueError for an unknown task."""
 
     task: str = "lift"  # one task, or several separated by commas, which are evaluated and reported separately
     fps: int = FPS
@@ -40,17 +36,12 @@ class So100SimConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         check_tasks(self.task_names)
+        action = PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))
+        state = PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,))
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
-        self.features = {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,)),
-            **{f"pixels/{camera}": image for camera in CAMERAS},
-        }
-        self.features_map = {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            **{f"pixels/{camera}": image_key(camera) for camera in CAMERAS},
-        }
+        self.features = {ACTION: action, "agent_pos": state, **{f"pixels/{camera}": image for camera in CAMERAS}}
+        images = {f"pixels/{camera}": image_key(camera) for camera in CAMERAS}
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, **images}
 
     @property
     def task_names(self) -> list[str]:

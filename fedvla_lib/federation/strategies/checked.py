@@ -9,7 +9,7 @@ and the client drift.
 import logging
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,21 +25,11 @@ from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SampledNodes:
-    """Grid stub that lists only the sampled nodes."""
-
-    node_ids: list[int]
-
-    def get_node_ids(self) -> list[int]:
-        """Return the sampled nodes."""
-        return self.node_ids
+PERSISTENT = ("momentum_vector", "m_t", "v_t", "control")  # attributes of strategies that persist between rounds
 
 
 class Checked:
-    """Mixin: write ``class CheckedX(Checked, X)`` for a Flower strategy X derived from FedAvg.
+    """Mixin: ``class CheckedX(Checked, X)`` for a Flower strategy X derived from FedAvg.
 
     Args:
         config: settings of the run: sampling, encoding of arrays, clipping, replies that a round needs.
@@ -52,19 +42,11 @@ class Checked:
     """
 
     _extra_records: tuple[str, ...] = ()  # records of arrays in a training reply beside the model's
-    _persistent: tuple[str, ...] = ()  # attributes of the Flower strategy that persist between rounds
 
     def __init__(
-        self,
-        *,
-        config: Config,
-        roster: Roster,
-        shapes: Shapes,
-        report: Report,
-        keep_rollouts: Callable[[int, str, messages.Rollouts], None],
-        rounds_done: int = 0,
-        **flower: Any,
-    ) -> None:
+        self, *, config: Config, roster: Roster, shapes: Shapes, report: Report,
+        keep_rollouts: Callable[[int, str, messages.Rollouts], None], rounds_done: int = 0, **flower: Any,
+    ) -> None:  # fmt: skip
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.config, self.roster, self.shapes = config, roster, shapes
         self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
@@ -76,22 +58,18 @@ class Checked:
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """Sample clients and address the global arrays, with their SHA-256, to each."""
-        server_round += self.rounds_done
-        selection = self._select(self.config.fraction_train, server_round, 0)
         self._global = messages.unpack_arrays(arrays)
-        config[messages.DIGEST] = digest(self._downward(arrays))
-        return self._counted(super().configure_train(server_round, arrays, config, selection))
+        sampled = self._sample(self.config.fraction_train, server_round, 0)
+        return super().configure_train(server_round + self.rounds_done, arrays, config, sampled)
 
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
         """The same for evaluation; other clients may be sampled."""
-        server_round += self.rounds_done
-        selection = self._select(self.config.fraction_evaluate, server_round, 1)
-        if not selection.node_ids:
+        sampled = self._sample(self.config.fraction_evaluate, server_round, 1)
+        if not self._sampled:
             return []
-        config[messages.DIGEST] = digest(self._downward(arrays))
-        return self._counted(super().configure_evaluate(server_round, arrays, config, selection))
+        return super().configure_evaluate(server_round + self.rounds_done, arrays, config, sampled)
 
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
@@ -110,7 +88,8 @@ class Checked:
         for reply in valid if self.config.clip_norm else []:
             self._clip(reply)
         arrays, metrics = super().aggregate_train(server_round, valid)
-        return _as_float32(arrays), metrics
+        # Flower's adaptive strategies compute in float64.
+        return ArrayRecord({n: Array(np.asarray(a.numpy(), np.float32)) for n, a in arrays.items()}), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the valid replies of clients that have held-out episodes."""
@@ -124,12 +103,9 @@ class Checked:
 
     def state(self) -> dict[str, Arrays]:
         """Return the strategy's state beside the global arrays: by attribute, then by name."""
-        kept = {attribute: getattr(self, attribute) for attribute in self._persistent}
-        return {
-            attribute: dict(value) if isinstance(value, dict) else {str(i): array for i, array in enumerate(value)}
-            for attribute, value in kept.items()
-            if value is not None
-        }
+        kept = {name: value for name in PERSISTENT if (value := getattr(self, name, None)) is not None}
+        listed = {name: {str(i): a for i, a in enumerate(value)} for name, value in kept.items() if type(value) is list}
+        return {name: listed.get(name) or dict(value) for name, value in kept.items()}
 
     def load_state(self, state: dict[str, Arrays]) -> None:
         """Restore what `state` returned in another process."""
@@ -137,14 +113,15 @@ class Checked:
             listed = all(name.isdecimal() for name in arrays)
             setattr(self, attribute, [arrays[str(i)] for i in range(len(arrays))] if listed else arrays)
 
-    def _downward(self, arrays: ArrayRecord) -> Arrays:
-        return encode(messages.unpack_arrays(arrays), DOWNWARD[self.config.exchange])
-
-    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
-        """Flower's, with encoded arrays; strategies have stored the unrounded ones by now."""
+    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
+        """Flower's, with encoded arrays and their SHA-256; strategies have stored the unrounded ones by now."""
+        arrays = encode(messages.unpack_arrays(record[messages.ARRAYS]), DOWNWARD[self.config.exchange])
+        record[messages.CONFIG][messages.DIGEST] = digest(arrays)
         if self.config.exchange != "float32":
-            record[messages.ARRAYS] = messages.pack_arrays(self._downward(record[messages.ARRAYS]))
-        return super()._construct_messages(record, node_ids, message_type)
+            record[messages.ARRAYS] = messages.pack_arrays(arrays)
+        sent = list(super()._construct_messages(record, node_ids, message_type))
+        self._sent_bytes = sum(messages.count_bytes(message.content) for message in sent)
+        return sent
 
     def _restore(self, reply: Message) -> None:
         """Replace the encoded update in a reply by the arrays: global arrays plus update."""
@@ -169,15 +146,11 @@ class Checked:
         for who, values in geometry(self._global, ends).items():
             self.report(server_round, who, "drift", values)
 
-    def _counted(self, sent: Iterable[Message]) -> list[Message]:
-        sent = list(sent)
-        self._sent_bytes = sum(messages.count_bytes(message.content) for message in sent)
-        return sent
-
-    def _select(self, share: float, server_round: int, purpose: int) -> SampledNodes:
-        rng = np.random.default_rng([self.config.seed, server_round, purpose])
+    def _sample(self, share: float, server_round: int, purpose: int) -> SimpleNamespace:
+        """Sample clients, and return a stand-in for the grid that lists only them."""
+        rng = np.random.default_rng([self.config.seed, server_round + self.rounds_done, purpose])
         self._sampled = self.roster.sample(share, rng)
-        return SampledNodes(self._sampled)
+        return SimpleNamespace(get_node_ids=lambda: self._sampled)
 
     def _valid(
         self, server_round: int, kind: str, replies: Iterable[Message], check: Callable[[Message], None]
@@ -194,7 +167,9 @@ class Checked:
                 self._reject(server_round, self.roster.name(node), kind, error)
             else:
                 valid.append(by_node[node])
-                self.report(server_round, self.roster.name(node), kind, _values(by_node[node]))
+                values = by_node[node].content.metric_records[messages.METRICS]
+                values = {key.replace("-", "_"): value for key, value in values.items()}
+                self.report(server_round, self.roster.name(node), kind, values)
         counts = {f"rejected_{reason}": rejected.count(reason) for reason in sorted(set(rejected))}
         if self._sampled:
             counted = {"to": kind, "good": len(valid), "rejected": len(rejected)}
@@ -242,16 +217,5 @@ def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
             raise ParameterError("metrics", f"{key}={value!r} is not a finite number")
 
 
-def _as_float32(arrays: ArrayRecord | None) -> ArrayRecord | None:
-    """Cast back to float32: Flower's adaptive strategies compute in float64."""
-    if arrays is None:
-        return None
-    return ArrayRecord({name: Array(np.asarray(array.numpy(), np.float32)) for name, array in arrays.items()})
-
-
 def _examples(reply: Message) -> Any:
     return reply.content.metric_records[messages.METRICS].get(messages.EXAMPLES)
-
-
-def _values(reply: Message) -> dict[str, Any]:
-    return {key.replace("-", "_"): value for key, value in reply.content.metric_records[messages.METRICS].items()}

@@ -1,11 +1,9 @@
-"""FedProx: FedAvg whose clients are pulled towards the global model."""
+"""FedProx: FedAvg whose clients are pulled towards the global model; the client side."""
 
 from collections.abc import Mapping
 
 import torch
-from flwr.serverapp.strategy import FedProx
 
-from fedvla_lib.federation.strategies.checked import Checked
 from fedvla_lib.policy.training import Parameters, with_gradient
 
 
@@ -28,7 +26,3 @@ class Proximal:
         if self._mu:
             for name, parameter in with_gradient(parameters, self._anchor):
                 parameter.grad.add_(parameter.detach() - self._anchor[name], alpha=self._mu)
-
-
-class CheckedFedProx(Checked, FedProx):
-    """FedAvg whose clients add mu / 2 ||w - w_global||^2 to their loss (https://arxiv.org/abs/1812.06127)."""

@@ -1,12 +1,10 @@
 """SCAFFOLD: control variates correct the clients' gradients; client side and server side."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import torch
-from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, RecordDict
-from flwr.serverapp import Grid
+from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp.strategy import FedAvg
 
 from fedvla_lib.federation import messages
@@ -65,23 +63,17 @@ class CheckedScaffold(Checked, FedAvg):
     """
 
     _extra_records = (messages.CONTROL,)
-    _persistent = ("control",)
 
     def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
         super().__init__(**checked)
         self.weights = weights
         self.control: Arrays = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
 
-    def configure_train(
-        self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
-    ) -> Iterable[Message]:
-        """Announce the control variate's SHA-256 beside the arrays'."""
-        config[messages.CONTROL_DIGEST] = digest(self.control)
-        return super().configure_train(server_round, arrays, config, grid)
-
-    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> Iterable[Message]:
+    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
+        """Add the server's control variate and its SHA-256."""
         if message_type == MessageType.TRAIN:
             record[messages.CONTROL] = messages.pack_arrays(self.control)
+            record[messages.CONFIG][messages.CONTROL_DIGEST] = digest(self.control)
         return super()._construct_messages(record, node_ids, message_type)
 
     def _before_aggregation(self, server_round: int, replies: list[Message]) -> None:
