@@ -1,6 +1,6 @@
 """A chapter's training cell alone, and beside other programs that keep cores busy: one thread against one per core.
 
-    python benchmarks/busy.py
+python benchmarks/busy.py
 """
 
 import subprocess

@@ -20,7 +20,7 @@ MASKED = torch.finfo(torch.float32).min
 
 
 @dataclass(frozen=True)
-class _Attention:
+class _Shared:
     """What all layers of one kind share in a batch."""
 
     cos: Tensor  # of the queries' rotary angles, (B or 1, 1, chunk, head dim / 2)
@@ -58,17 +58,18 @@ def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor,
     """
     model, width = policy.model, policy.config.action_feature.shape[0]
     vlm, expert = model.vlm_with_expert, model.vlm_with_expert.lm_expert
-    to_self, to_prefix = _shared(real, noisy.shape[1], stored.shape[3], vlm.num_attention_heads, stored.shape[-1])
+    to_self, to_prefix = _tables(real, noisy.shape[1], stored.shape[3], vlm.num_attention_heads, stored.shape[-1])
     hidden = _embedded(policy, noisy, times).flatten(0, 1)  # (B * chunk, expert width)
     every = vlm.self_attn_every_n_layers
     for index, layer in enumerate(expert.layers):
         is_self = "cross" not in vlm.attention_mode or (every > 0 and index % every == 0)
-        attend = _self_attention if is_self else _cross_attention
-        mixed = attend(layer, hidden, stored[:, index], to_self if is_self else to_prefix)
-        hidden = torch.addmm(hidden, mixed, layer.self_attn.o_proj.weight.t())
-        norm, mlp = layer.post_attention_layernorm, layer.mlp
-        both = NormedLinear.apply(hidden, norm.weight, norm.variance_epsilon, mlp.gate_proj.weight, mlp.up_proj.weight)
-        hidden = torch.addmm(hidden, Gated.apply(both), mlp.down_proj.weight.t())
+        block, shared = (_SelfAttention, to_self) if is_self else (_CrossAttention, to_prefix)
+        part, norm = layer.self_attn, layer.input_layernorm
+        weights = (each.weight for each in (norm, part.q_proj, part.k_proj, part.v_proj, part.o_proj))
+        hidden = block.apply(hidden, norm.variance_epsilon, stored[:, index], shared, *weights)
+        mlp, norm = layer.mlp, layer.post_attention_layernorm
+        weights = (each.weight for each in (norm, mlp.gate_proj, mlp.up_proj, mlp.down_proj))
+        hidden = _FeedForward.apply(hidden, norm.variance_epsilon, *weights)
     out = model.action_out_proj
     return functional.linear(expert.norm(hidden), out.weight[:width], out.bias[:width]).view(*noisy.shape[:2], width)
 
@@ -84,7 +85,7 @@ def _embedded(policy: SmolVLAPolicy, noisy: Tensor, times: Tensor) -> Tensor:
     return model.action_time_mlp_out(functional.silu(fused))
 
 
-def _shared(real: Tensor, chunk: int, groups: int, heads: int, size: int) -> tuple[_Attention, _Attention]:
+def _tables(real: Tensor, chunk: int, groups: int, heads: int, size: int) -> tuple[_Shared, _Shared]:
     """What layers share that attend to prefix and chunk, and what those share that attend to the prefix only."""
     count, length = real.shape
     steps = torch.arange(chunk, device=real.device)
@@ -96,8 +97,8 @@ def _shared(real: Tensor, chunk: int, groups: int, heads: int, size: int) -> tup
         whole = mask[:, None, None].expand(-1, groups, heads // groups, -1, -1)
         return whole.reshape(count * groups, -1, mask.shape[-1])
 
-    whole = _Attention(*_angles(after, size), stacked(torch.cat([padded, later], 2)))
-    return whole, _Attention(*_angles(steps[None], size), stacked(padded))
+    whole = _Shared(*_angles(after, size), stacked(torch.cat([padded, later], 2)))
+    return whole, _Shared(*_angles(steps[None], size), stacked(padded))
 
 
 def _angles(positions: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -107,134 +108,147 @@ def _angles(positions: Tensor, size: int) -> tuple[Tensor, Tensor]:
     return torch.cos(radians), torch.sin(radians)
 
 
-def _self_attention(layer: torch.nn.Module, hidden: Tensor, stored: Tensor, shared: _Attention) -> Tensor:
-    """Attend to the prefix and to the actions so far, (B * chunk, heads * head dim) before the output projection."""
-    part, norm = layer.self_attn, layer.input_layernorm
-    weights = part.q_proj.weight, part.k_proj.weight, part.v_proj.weight
-    count, _, groups, _, size = stored.shape
-    joint = NormedLinear.apply(hidden, norm.weight, norm.variance_epsilon, *weights)
-    queries, keys, values = joint.view(count, -1, joint.shape[1] // size, size).transpose(1, 2).split(
-        [weights[0].shape[0] // size, groups, groups], 1
-    )  # fmt: skip
-    queries, keys = (Rotated.apply(each, shared.cos, shared.sin) for each in (queries, keys))
-    return _merged(Attended.apply(queries, keys, values, stored, shared.mask))
+class _FeedForward(Function):
+    """``x + D (silu(G n) * U n)`` with n = x / rms(x) * gain, for x (N, width) and matrices gate G, up U and down D."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, eps: float, gain: Tensor, gate: Tensor, up: Tensor, down: Tensor) -> Tensor:
+        normed, scale = _normed(x, eps)
+        inward = torch.cat([gate, up])
+        both = torch.mm(normed, (inward * gain).t())
+        active = functional.silu(both[:, : len(gate)])
+        inner = active * both[:, len(gate) :]
+        ctx.save_for_backward(normed, scale, gain, inward, down, both, active, inner)
+        return torch.addmm(x, inner, down.t())
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple:
+        normed, scale, gain, inward, down, both, active, inner = ctx.saved_tensors
+        of_inner, of_both, width = torch.mm(grad, down), torch.empty_like(both), inner.shape[1]
+        torch.mul(of_inner, active, out=of_both[:, width:])
+        of_active = of_inner.mul_(both[:, width:])
+        torch.ops.aten.silu_backward.grad_input(of_active, both[:, :width], grad_input=of_both[:, :width])
+        of_x, of_gain, of_inward = _linear_gradients(of_both, normed, scale, gain, inward)
+        return of_x.add_(grad), None, of_gain, *of_inward.chunk(2), torch.mm(grad.t(), inner)
 
 
-def _cross_attention(layer: torch.nn.Module, hidden: Tensor, stored: Tensor, shared: _Attention) -> Tensor:
-    """Attend to the prefix, whose keys and values the layer projects once more."""
-    part, norm = layer.self_attn, layer.input_layernorm
-    count, _, groups, length, size = stored.shape
-    queries = NormedLinear.apply(hidden, norm.weight, norm.variance_epsilon, part.q_proj.weight)
-    queries = queries.view(count, -1, queries.shape[1] // size, size).transpose(1, 2)
-    flat = stored.permute(1, 0, 3, 2, 4).reshape(2, count * length, groups * size)
-    keys, values = (
-        torch.mm(each, projection.weight.t()).view(count, length, groups, size).transpose(1, 2)
-        for each, projection in zip(flat, (part.k_proj, part.v_proj), strict=True)
-    )
-    return _merged(Attended.apply(Rotated.apply(queries, shared.cos, shared.sin), keys, values, None, shared.mask))
+class _SelfAttention(Function):
+    """``x + O a`` where a attends to the constant keys and values of the prefix and to those of the chunk so far."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, eps: float, stored: Tensor, shared: _Shared, gain: Tensor, *weights: Tensor) -> Tensor:
+        count, _, groups, length, size = stored.shape
+        *inward, out = weights
+        normed, scale = _normed(x, eps)
+        joint = torch.cat(inward)
+        heads = torch.mm(normed, (joint * gain).t()).view(count, -1, len(joint) // size, size).transpose(1, 2)
+        queries, keys, values = heads.split([len(each) // size for each in inward], 1)
+        both = stored.new_empty(2, count, groups, length + keys.shape[2], size)
+        both[:, :, :, :length] = stored.transpose(0, 1)
+        _turn(keys, shared.cos, shared.sin, both[0, :, :, length:])
+        both[1, :, :, length:] = values
+        asked, mixed, share = _attend(queries, *both, shared)
+        ctx.shared, ctx.shape, ctx.rows = shared, stored.shape, [len(each) for each in inward]
+        ctx.save_for_backward(normed, scale, gain, joint, out, asked, both, share, mixed)
+        return torch.addmm(x, mixed, out.t())
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple:
+        normed, scale, gain, joint, out, asked, both, share, mixed = ctx.saved_tensors
+        count, _, groups, length, size = ctx.shape
+        of_joint = grad.new_empty(count, mixed.shape[0] // count, len(joint) // size, size)
+        of_queries, of_keys, of_values = of_joint.transpose(1, 2).split([rows // size for rows in ctx.rows], 1)
+        of_own = _attention_gradients(torch.mm(grad, out), asked, both, share, ctx.shared, of_queries, length)
+        _turn(of_own[0], ctx.shared.cos, -ctx.shared.sin, of_keys)
+        of_values.copy_(of_own[1])
+        of_x, of_gain, of_inward = _linear_gradients(of_joint.view(len(grad), -1), normed, scale, gain, joint)
+        return of_x.add_(grad), None, None, None, of_gain, *of_inward.split(ctx.rows), torch.mm(grad.t(), mixed)
 
 
-def _merged(heads: Tensor) -> Tensor:
-    """(B, heads, T, head dim) -> (B * T, heads * head dim)."""
-    return heads.transpose(1, 2).reshape(heads.shape[0] * heads.shape[2], -1)
+class _CrossAttention(Function):
+    """``x + O a`` where a attends to the prefix, whose keys and values the layer projects once more."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, eps: float, stored: Tensor, shared: _Shared, gain: Tensor, *weights: Tensor) -> Tensor:
+        count, _, groups, length, size = stored.shape
+        of_queries, *inward, out = weights
+        normed, scale = _normed(x, eps)
+        queries = torch.mm(normed, (of_queries * gain).t()).view(count, -1, len(of_queries) // size, size)
+        flat = stored.permute(1, 0, 3, 2, 4).reshape(2, count * length, groups * size)
+        both = torch.stack([torch.mm(each, weight.t()) for each, weight in zip(flat, inward, strict=True)])
+        both = both.view(2, count, length, groups, size).transpose(2, 3).contiguous()
+        asked, mixed, share = _attend(queries.transpose(1, 2), *both, shared)
+        ctx.shared = shared
+        ctx.save_for_backward(normed, scale, gain, of_queries, out, asked, both, share, mixed, flat)
+        return torch.addmm(x, mixed, out.t())
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple:
+        normed, scale, gain, weight, out, asked, both, share, mixed, flat = ctx.saved_tensors
+        count, size = both.shape[1], both.shape[-1]
+        of_rows = grad.new_empty(count, len(grad) // count, len(weight) // size, size)
+        of_both = _attention_gradients(torch.mm(grad, out), asked, both, share, ctx.shared, of_rows.transpose(1, 2))
+        of_inward = [
+            torch.mm(each.transpose(1, 2).reshape(rows.shape).t(), rows)
+            for each, rows in zip(of_both, flat, strict=True)
+        ]
+        of_x, of_gain, of_weight = _linear_gradients(of_rows.view(len(grad), -1), normed, scale, gain, weight)
+        return of_x.add_(grad), None, None, None, of_gain, of_weight, *of_inward, torch.mm(grad.t(), mixed)
 
 
-class NormedLinear(Function):
-    """``y = (g * x / rms(x)) W'`` for several matrices W below each other; the gain g is multiplied into W.
+def _normed(x: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Divide each row by its root mean square; return the rows, and the factors (N, 1)."""
+    scale = torch.linalg.vector_norm(x, dim=1, keepdim=True).square_().div_(x.shape[1]).add_(eps).rsqrt_()
+    return x * scale, scale
 
-    With n = x / rms(x) and G = dL/dy: dW = g * (G' n), dg = sum over rows of W * (G' n), and for dn = G (g * W):
-    dx = (dn - n * mean(dn * n)) / rms(x).
+
+def _linear_gradients(grad: Tensor, normed: Tensor, scale: Tensor, gain: Tensor, weight: Tensor) -> tuple:
+    """Gradients of x, gain g and weight W of ``y = (g * n) W'`` with n = x / rms(x), from G = dL/dy.
+
+    dW = g * (G' n), dg = sum over rows of W * (G' n), and for dn = G (g * W): dx = (dn - n * mean(dn * n)) / rms(x).
     """
-
-    @staticmethod
-    def forward(ctx, x: Tensor, gain: Tensor, eps: float, *weights: Tensor) -> Tensor:
-        scale = torch.linalg.vector_norm(x, dim=1, keepdim=True).square_().div_(x.shape[1]).add_(eps).rsqrt_()
-        normed, weight = x * scale, weights[0] if len(weights) == 1 else torch.cat(weights)
-        ctx.rows = [each.shape[0] for each in weights]
-        ctx.save_for_backward(normed, scale, gain, weight)
-        return torch.mm(normed, (weight * gain).t())
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        normed, scale, gain, weight = ctx.saved_tensors
-        product = torch.mm(normed.t(), grad).t()
-        of_normed = torch.mm(grad, weight * gain)
-        share = torch.linalg.vecdot(of_normed, normed)[:, None].div_(normed.shape[1])
-        of_x = torch.addcmul(of_normed, normed, share, value=-1).mul_(scale)
-        return of_x, (product * weight).sum(0), None, *(product * gain).split(ctx.rows)
+    product = torch.mm(grad.t(), normed)
+    of_normed = torch.mm(grad, weight * gain)
+    share = torch.linalg.vecdot(of_normed, normed)[:, None].div_(normed.shape[1])
+    of_x = torch.addcmul(of_normed, normed, share, value=-1).mul_(scale)
+    return of_x, (product * weight).sum(0), product.mul_(gain)
 
 
-class Gated(Function):
-    """``silu(a) * b`` for a matrix with a in its left half and b in its right."""
-
-    @staticmethod
-    def forward(ctx, both: Tensor) -> Tensor:
-        gate, up = both.chunk(2, 1)
-        sigmoid = torch.sigmoid(gate)
-        active = gate * sigmoid
-        ctx.save_for_backward(both, sigmoid, active)
-        return active * up
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        both, sigmoid, active = ctx.saved_tensors
-        out = torch.empty_like(both)
-        of_gate, of_up = out.chunk(2, 1)
-        torch.mul(grad, active, out=of_up)
-        slope = torch.addcmul(sigmoid, active, 1 - sigmoid)  # of silu
-        torch.mul(slope, both.chunk(2, 1)[1], out=of_gate).mul_(grad)
-        return out
-
-
-class Rotated(Function):
-    """Rotary positions: each pair (x_i, x_{i + half}) of (B, heads, T, head dim) turned by its angle."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        ctx.save_for_backward(cos, sin)
-        return _turned(x, cos, sin)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        cos, sin = ctx.saved_tensors
-        return _turned(grad, cos, -sin), None, None
-
-
-def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    out = torch.empty(x.shape, dtype=x.dtype, device=x.device)
+def _turn(x: Tensor, cos: Tensor, sin: Tensor, out: Tensor) -> Tensor:
+    """Rotary positions: turn each pair (x_i, x_{i + half}) of (B, heads, T, head dim) by its angle, into `out`."""
     (left, right), (out_left, out_right) = x.chunk(2, -1), out.chunk(2, -1)
     torch.mul(left, cos, out=out_left).addcmul_(right, sin, value=-1)
     torch.mul(right, cos, out=out_right).addcmul_(left, sin)
     return out
 
 
-class Attended(Function):
-    """Attention of (B, heads, T, head dim) queries to the keys of their group, with a prefix of constant keys in front.
+def _attend(queries: Tensor, keys: Tensor, values: Tensor, shared: _Shared) -> tuple[Tensor, Tensor, Tensor]:
+    """Attention of (B, heads, T, head dim) queries, not yet turned, to the (B, groups, keys, head dim) of their group.
 
-    Queries of a group share their keys, so they stand in one matrix and the keys are not repeated. Constant keys and
-    values have no gradient, and none is computed.
+    Queries of a group share their keys, so they stand in one matrix and the keys are not repeated.
+
+    Returns:
+        The queries, turned, (B * groups, heads per group * T, head dim); what they attend to, (B * T, heads * head
+        dim); the shares of attention, (B * groups, heads per group * T, keys).
     """
+    count, groups, _, size = keys.shape
+    turned = _turn(queries, shared.cos, shared.sin, queries.new_empty(queries.shape))
+    asked = turned.view(count * groups, -1, size)
+    share = torch.baddbmm(shared.mask, asked, keys.flatten(0, 1).transpose(1, 2), alpha=size**-0.5).softmax(-1)
+    mixed = torch.bmm(share, values.flatten(0, 1)).view(queries.shape).transpose(1, 2)
+    return asked, mixed.reshape(count * queries.shape[2], -1), share
 
-    @staticmethod
-    def forward(ctx, queries: Tensor, keys: Tensor, values: Tensor, prefix: Tensor | None, mask: Tensor) -> Tensor:
-        count, groups, own, size = keys.shape
-        fixed = 0 if prefix is None else prefix.shape[3]
-        both = keys.new_empty(2, count, groups, fixed + own, size)
-        if fixed:
-            both[:, :, :, :fixed] = prefix.transpose(0, 1)
-        both[0, :, :, fixed:], both[1, :, :, fixed:] = keys, values
-        asked, (told, said) = queries.reshape(count * groups, -1, size), both.flatten(1, 2)
-        share = torch.baddbmm(mask, asked, told.transpose(1, 2), alpha=size**-0.5).softmax(-1)
-        ctx.fixed, ctx.shape = fixed, keys.shape
-        ctx.save_for_backward(asked, told, said, share)
-        return torch.bmm(share, said).view(queries.shape)
 
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        asked, told, said, share = ctx.saved_tensors
-        rows = grad.reshape(asked.shape)
-        of_share = torch.bmm(rows, said.transpose(1, 2))
-        of_score = torch._softmax_backward_data(of_share, share, -1, share.dtype).mul_(asked.shape[-1] ** -0.5)
-        of_keys = torch.bmm(of_score[:, :, ctx.fixed :].transpose(1, 2), asked).view(ctx.shape)
-        of_values = torch.bmm(share[:, :, ctx.fixed :].transpose(1, 2), rows).view(ctx.shape)
-        return torch.bmm(of_score, told).view(grad.shape), of_keys, of_values, None, None
+def _attention_gradients(
+    grad: Tensor, asked: Tensor, both: Tensor, share: Tensor, shared: _Shared, of_queries: Tensor, fixed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Write the gradient of the queries into `of_queries`; return those of keys and values after the first `fixed`."""
+    count, heads, steps, size = of_queries.shape
+    keys, values = both.flatten(1, 2)
+    rows = grad.view(count, steps, heads, size).transpose(1, 2).reshape(asked.shape)
+    of_share = torch.bmm(rows, values.transpose(1, 2))
+    of_score = torch._softmax_backward_data(of_share, share, -1, share.dtype).mul_(size**-0.5)
+    _turn(torch.bmm(of_score, keys).view(of_queries.shape), shared.cos, -shared.sin, of_queries)
+    own = both.shape[1], both.shape[2], both.shape[3] - fixed, size
+    of_keys = torch.bmm(of_score[:, :, fixed:].transpose(1, 2), asked).view(own)
+    return of_keys, torch.bmm(share[:, :, fixed:].transpose(1, 2), rows).view(own)
