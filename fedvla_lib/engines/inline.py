@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 
 from flwr.app import Context, Error, Message, RecordDict, UserConfig
@@ -67,7 +68,7 @@ def run_inline(
     with _quiet_flower(), processes(jobs) if jobs > 1 else nullcontext() as pool:
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
         grid.pool = pool
-        server_app.build(loaders, engine="inline", progress=progress, states=grid, jobs=jobs)(grid, context)
+        server_app.build(loaders, engine="inline", progress=progress, jobs=jobs)(grid, context)
     return Path(context.state["run"]["folder"])
 
 
@@ -131,10 +132,8 @@ class InlineGrid(Grid):
         contexts = [self._contexts[message.metadata.dst_node_id] for message in ordered]
         for message in ordered:
             message.metadata.__dict__["_message_id"] = str(next(self._ids))  # replies refer to it, as on Flower's grids
-        if self.pool:
-            handled = self.pool.map(_in_worker, ordered, contexts)
-        else:
-            handled = (_handle(self._app, *each, self._raise_errors) for each in zip(ordered, contexts, strict=True))
+        here = partial(_handle, self._app, raise_errors=self._raise_errors)
+        handled = self.pool.map(_in_worker, ordered, contexts) if self.pool else map(here, ordered, contexts)
         bar = tqdm(handled, total=len(ordered), desc=f"clients: {kind}", disable=not (self._progress and ordered),
                    leave=False)  # fmt: skip
         for message, (reply, context, seconds) in zip(ordered, bar, strict=True):
