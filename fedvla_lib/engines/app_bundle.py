@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,13 @@ PROJECT = "fedvla-lib"  # name in pyproject.toml and of the installed package
 def stage_app(folder: Path) -> Path:
     """Copy the Flower app into ``folder/app`` and return that, since `flwr` would search the whole checkout.
 
-    A library installed from a wheel has no project file; the app then gets a minimal one.
+    Its project file is a minimal one, since a library installed from a wheel has none.
     """
     package = Path(__file__).resolve().parents[1]
     app = folder / "app"
     shutil.copytree(package, app / package.name, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
-    if _is_checkout(package.parent):
-        for name in ("pyproject.toml", "README.md", "LICENSE"):
-            shutil.copy(package.parent / name, app / name)
-    else:
-        (app / "pyproject.toml").write_text(_project_file(package.name))
+    (app / "pyproject.toml").write_text(_project_file(package.name))
     return app
-
-
-def _is_checkout(folder: Path) -> bool:
-    """Return whether `folder` is this project's checkout; site-packages may hold the pyproject.toml of another one."""
-    project = folder / "pyproject.toml"
-    return project.is_file() and tomllib.loads(project.read_text()).get("project", {}).get("name") == PROJECT
 
 
 def _project_file(package: str) -> str:

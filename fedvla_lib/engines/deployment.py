@@ -52,21 +52,18 @@ class Deployment:
         Raises:
             FlowerRunError: the SuperLink rejected it, it rejected the SuperLink, or could not connect; with its log.
         """
-        was_connected = _count(self.log(partition_id)) > 0
+        log = self.log(partition_id)
+        was_connected = _count(log) > 0
         deadline = time.monotonic() + processes.STARTUP_S
         while True:
+            before = _count(log), _count(log, UNTRUSTED)
+            self.launch_node(partition_id)
             try:
-                return self._try_node(partition_id)
+                return self.wait_for_node(partition_id, *before)
             except FlowerRunError:
                 if not was_connected or time.monotonic() > deadline:
                     raise
                 time.sleep(superlink.POLL_S)
-
-    def _try_node(self, partition_id: int) -> None:
-        log = self.log(partition_id)
-        before = _count(log), _count(log, UNTRUSTED)
-        self.launch_node(partition_id)
-        self.wait_for_node(partition_id, *before)
 
     def launch_node(self, partition_id: int) -> None:
         """Start the SuperNode of a client, and do not wait."""
@@ -81,10 +78,6 @@ class Deployment:
         processes.wait_until(lambda: _count(log) > connected or _count(log, UNTRUSTED) > untrusted, node, log, who)
         if _count(log) == connected:  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
-
-    def kill_node(self, partition_id: int) -> None:
-        """Kill a SuperNode and its child processes without warning, as a power cut would."""
-        processes.stop(self.nodes.pop(partition_id), (signal.SIGKILL,))
 
     def _command(self, partition_id: int) -> list[str]:
         node_config = f"partition-id={partition_id} num-partitions={self.num_clients}"

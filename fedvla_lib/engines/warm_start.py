@@ -7,6 +7,7 @@ LeRobot, which takes eight seconds. Nothing depends on this module: without it, 
 import json
 import os
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
@@ -44,7 +45,7 @@ def warm_start(environment: dict[str, str], log: Path) -> Iterator[dict[str, str
             address = os.path.join(folder, f"socket-{number}")
             server = _start_server(address, modules, environment, log)
             running.callback(processes.stop, server)
-            _write_stand_ins(Path(folder), programs, address)
+            _write_stand_ins(Path(folder), programs, address, environment["PATH"])
         path = os.pathsep.join([folder, environment["PATH"]])
         yield {**environment, **ray_python(os.path.join(folder, PYTHON)), "PATH": path}
 
@@ -63,10 +64,10 @@ def _start_server(address: str, modules: Sequence[str], environment: dict[str, s
         return processes.start([sys.executable, "-P", str(FORK_SERVER), "serve", *modules], environment, log, listener)
 
 
-def _write_stand_ins(folder: Path, programs: Sequence[str], address: str) -> None:
-    """Write a script for each program that has a fork server run it."""
+def _write_stand_ins(folder: Path, programs: Sequence[str], address: str, path: str) -> None:
+    """Write a script for each program on `path` that has a fork server run it."""
     call = [sys.executable, "-IS", str(FORK_SERVER), "call", address]  # without site-packages: faster
     for name in programs:
-        command = shlex.join(call if name == PYTHON else [*call, processes.program(name)])
+        command = shlex.join(call if name == PYTHON else [*call, shutil.which(name, path=path) or name])
         (folder / name).write_text(f'#!/bin/sh\nexec {command} "$@"\n')
         (folder / name).chmod(0o700)
