@@ -94,14 +94,16 @@ def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
     stranger = credentials.make_node_key(tmp_path, "stranger")
     intruder = replace(standing, keys=[stranger, stranger], nodes={}, folder=tmp_path)
     with pytest.raises(processes.FlowerRunError, match=r"SuperNode of client 0 ended with status [1-9]"):
-        intruder.start_node(0)
+        intruder.launch_node(0)
+        intruder.wait_for_node(0)
     assert deployment.CONNECTED not in intruder.log(0).read_text()
 
 
 def refusal(node_of: deployment.Deployment) -> str:
     """Start a SuperNode of the deployment, which must reject the server at once, and return its log."""
     with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
-        node_of.start_node(0)
+        node_of.launch_node(0)
+        node_of.wait_for_node(0)
     processes.stop(node_of.nodes[0])
     return node_of.log(0).read_text()
 
@@ -137,6 +139,19 @@ def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deploymen
     assert_faults_were_survived(max(run_folder.run_folders(tiny)), tiny)
 
 
+def start_again(here: deployment.Deployment, partition_id: int) -> None:
+    """Start a killed SuperNode, as a service manager would: its key is refused until the SuperLink misses the old."""
+    deadline = time.monotonic() + processes.STARTUP_S
+    while True:
+        here.launch_node(partition_id)
+        try:
+            return here.wait_for_node(partition_id)
+        except processes.FlowerRunError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1)
+
+
 def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
     """Killed after round 1 and restarted with its key once a round has run without it."""
     config = replace(tiny, num_server_rounds=5, local_steps=2)
@@ -150,7 +165,7 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
             happened.append("killed")
         if "rejected" in kinds and happened == ["killed"]:
             happened.append("started again")
-            standing.start_node(1)
+            start_again(standing, 1)
 
     deployment.submit(standing, config, 900, meddle)
     root = max(run_folder.run_folders(config))

@@ -14,27 +14,25 @@ PROJECT = "fedvla-lib"  # name in pyproject.toml and of the installed package
 def stage_app(folder: Path) -> Path:
     """Copy the Flower app into ``folder/app`` and return that, since `flwr` would search the whole checkout.
 
-    Its project file is a minimal one, since a library installed from a wheel has none.
+    Its pyproject.toml is minimal, since a library installed from a wheel has none: name, the two apps, the settings and
+    the files to bundle.
     """
     package = Path(__file__).resolve().parents[1]
     app = folder / "app"
     shutil.copytree(package, app / package.name, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
-    (app / "pyproject.toml").write_text(_project_file(package.name))
-    return app
-
-
-def _project_file(package: str) -> str:
-    """Return a minimal pyproject.toml for `flwr`: name, the two apps, the settings and the files to bundle."""
     release = provenance.version_of(PROJECT) or "0"  # the library may have been copied, not installed
     tables = {
         "project": {"name": PROJECT, "version": release, "description": "", "license": "Apache-2.0"},
-        "tool.flwr.app": {"publisher": "fedvla", "fab-include": [f"{package}/**/*.py"]},
+        "tool.flwr.app": {"publisher": "fedvla", "fab-include": [f"{package.name}/**/*.py"]},
         "tool.flwr.app.components": {
-            "serverapp": f"{package}.federation.server_app:app", "clientapp": f"{package}.federation.client_app:app",
+            "serverapp": f"{package.name}.federation.server_app:app",
+            "clientapp": f"{package.name}.federation.client_app:app",
         },
         "tool.flwr.app.config": to_run_config(Config()),
-    }  # fmt: skip
-    return "\n".join(f"[{name}]\n{_toml(values)}" for name, values in tables.items())
+    }
+    project = "\n".join(f"[{name}]\n{_toml(values)}" for name, values in tables.items())
+    (app / "pyproject.toml").write_text(project)
+    return app
 
 
 def write_settings(folder: Path, config: Config) -> Path:

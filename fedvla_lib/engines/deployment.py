@@ -8,7 +8,6 @@ import json
 import signal
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -43,40 +42,26 @@ class Deployment:
         """Return the path of a node's log."""
         return self.folder / f"node_{partition_id}" / "supernode.log"
 
-    def start_node(self, partition_id: int) -> None:
-        """Start the SuperNode of a client and wait until the SuperLink has accepted it.
+    def launch_node(self, partition_id: int) -> None:
+        """Start the SuperNode of a client with a new log, and do not wait."""
+        log = self.log(partition_id)
+        log.parent.mkdir(exist_ok=True)
+        log.unlink(missing_ok=True)
+        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
+        self.nodes[partition_id] = processes.start(self._command(partition_id), environment, log)
 
-        A SuperLink rejects a key until it notices that the previous node with that key is gone, so a restart is retried
-        for up to two minutes, as a service manager would.
+    def wait_for_node(self, partition_id: int) -> None:
+        """Wait until the SuperLink has accepted a SuperNode.
+
+        A SuperLink rejects a key until it notices that the previous node with that key is gone, so whoever restarts a
+        node has to try again for up to two minutes, as service managers do.
 
         Raises:
             FlowerRunError: the SuperLink rejected it, it rejected the SuperLink, or could not connect; with its log.
         """
-        log = self.log(partition_id)
-        was_connected = _count(log) > 0
-        deadline = time.monotonic() + processes.STARTUP_S
-        while True:
-            before = _count(log), _count(log, UNTRUSTED)
-            self.launch_node(partition_id)
-            try:
-                return self.wait_for_node(partition_id, *before)
-            except FlowerRunError:
-                if not was_connected or time.monotonic() > deadline:
-                    raise
-                time.sleep(superlink.POLL_S)
-
-    def launch_node(self, partition_id: int) -> None:
-        """Start the SuperNode of a client, and do not wait."""
-        log = self.log(partition_id)
-        log.parent.mkdir(exist_ok=True)
-        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
-        self.nodes[partition_id] = processes.start(self._command(partition_id), environment, log)
-
-    def wait_for_node(self, partition_id: int, connected: int = 0, untrusted: int = 0) -> None:
-        """Wait until a SuperNode's log says more often than before that it was accepted, as `start_node` does."""
         node, log, who = self.nodes[partition_id], self.log(partition_id), f"the SuperNode of client {partition_id}"
-        processes.wait_until(lambda: _count(log) > connected or _count(log, UNTRUSTED) > untrusted, node, log, who)
-        if _count(log) == connected:  # it would retry forever
+        processes.wait_until(lambda: _says(log, CONNECTED) or _says(log, UNTRUSTED), node, log, who)
+        if not _says(log, CONNECTED):  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
 
     def _command(self, partition_id: int) -> list[str]:
@@ -199,5 +184,5 @@ def _events(config: Config, before: set[Path]) -> list[dict[str, Any]]:
     return run_folder.read_events(root) if root and (root / run_folder.METRICS_FILE).is_file() else []
 
 
-def _count(log: Path, text: str = CONNECTED) -> int:
-    return log.read_text(errors="replace").count(text) if log.exists() else 0
+def _says(log: Path, text: str) -> bool:
+    return text in log.read_text(errors="replace")

@@ -9,7 +9,6 @@ import os
 import shlex
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -43,8 +42,11 @@ def warm_start(environment: dict[str, str], log: Path) -> Iterator[dict[str, str
             return
         for number, (programs, modules) in enumerate(SERVERS.items()):
             address = os.path.join(folder, f"socket-{number}")
-            server = _start_server(address, modules, environment, log)
-            running.callback(processes.stop, server)
+            command = [sys.executable, "-P", str(FORK_SERVER), "serve", *modules]
+            with socket.socket(socket.AF_UNIX) as listener:  # calls wait in its queue until the modules are loaded
+                listener.bind(address)
+                listener.listen(128)
+                running.callback(processes.stop, processes.start(command, environment, log, listener))
             _write_stand_ins(Path(folder), programs, address, environment["PATH"])
         path = os.pathsep.join([folder, environment["PATH"]])
         yield {**environment, **ray_python(os.path.join(folder, PYTHON)), "PATH": path}
@@ -54,14 +56,6 @@ def ray_python(python: str) -> dict[str, str]:
     """Return the environment with which Ray starts its workers with an interpreter."""
     # Ray pastes the path into a shell command unquoted, which fails if a folder's name has a space.
     return {"RAY_JOB_CONFIG_JSON_ENV_VAR": json.dumps({"runtime_env": {"py_executable": shlex.quote(python)}})}
-
-
-def _start_server(address: str, modules: Sequence[str], environment: dict[str, str], log: Path) -> subprocess.Popen:
-    """Start a fork server; calls wait in the queue of its socket until it has loaded the modules."""
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(address)
-        listener.listen(128)
-        return processes.start([sys.executable, "-P", str(FORK_SERVER), "serve", *modules], environment, log, listener)
 
 
 def _write_stand_ins(folder: Path, programs: Sequence[str], address: str, path: str) -> None:

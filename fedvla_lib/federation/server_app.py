@@ -18,7 +18,7 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
-from fedvla_lib.federation.client import LOADERS, Loaders, kept_between_rounds
+from fedvla_lib.federation.client import LOADERS, Loaders
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
@@ -148,7 +148,11 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     """Return the checkpoint to resume from, and remove what was written of later rounds."""
     if not config.resume:
         return None
-    settings = [setting for setting, kept in kept_between_rounds(config).items() if kept]
+    keeps_state = {
+        f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
+        f"exchange={config.exchange}": config.exchange != "float32", "personal": config.personal,
+    }  # fmt: skip
+    settings = [setting for setting, kept in keeps_state.items() if kept]
     if settings and not states:
         raise ValueError(
             f"{settings[0]} makes clients keep state between rounds, which is lost when a run ends on this "
