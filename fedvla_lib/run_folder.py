@@ -122,7 +122,11 @@ def _existing(root: Path) -> Path:
 
 
 def resumable(root: Path, config: Config) -> dict[str, Any]:
-    """Return the stamp of a run that can be resumed; ValueError if it is none, is completed, or has other settings."""
+    """Return the stamp of a run that can be resumed with these settings.
+
+    Raises:
+        ValueError: not a run folder, a completed run, or a run with other settings.
+    """
     stamp, saved = read_stamp(_existing(root)), read_config(root)
     if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to resume")

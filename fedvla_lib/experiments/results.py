@@ -24,7 +24,10 @@ def read_results(folder: Path) -> pd.DataFrame:
 
     train_s is NaN if the stamp has no training time. steps_in_all and steps_in_a_row are gradient steps of the model
     that made the rollout. `counted` tells whether they were counted while training; for older cells they are derived
-    from the settings, and a local-only client gets its share of the total. Raises ValueError if there is no result.
+    from the settings, and a local-only client gets its share of the total.
+
+    Raises:
+        ValueError: there is no result.
     """
     return pd.concat([_rollouts(cell) for cell in cell_folders(folder)], ignore_index=True)
 
