@@ -94,12 +94,12 @@ def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsy
 
 
 @pytest.mark.unit
-def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path):
-    app = app_bundle.stage_app(tmp_path / "stage")
+def test_the_staged_app_holds_the_library_and_the_settings_of_the_run(tiny, tmp_path):
+    app = app_bundle.stage_app(tmp_path / "stage", tiny)
     assert (app / "fedvla_lib/federation/server_app.py").is_file()
     assert not list(app.rglob("__pycache__"))
-    settings = app_bundle.write_settings(tmp_path, tiny).read_text()
-    assert from_run_config(tomllib.loads(settings)) == tiny
+    project = tomllib.loads((app / "pyproject.toml").read_text())
+    assert from_run_config(project["tool"]["flwr"]["app"]["config"]) == tiny
 
 
 @pytest.mark.unit
@@ -108,8 +108,8 @@ def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
     package = PYPROJECT.parent / "fedvla_lib"
     alone = shutil.copytree(package, tmp_path / "site/fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
     (alone.parent / "pyproject.toml").write_text('[project]\nname = "another"\n')
-    code = "import pathlib, sys; from fedvla_lib.engines import app_bundle\n"
-    code += "print(app_bundle.stage_app(pathlib.Path(sys.argv[1])))"
+    code = "import pathlib, sys; from fedvla_lib import config; from fedvla_lib.engines import app_bundle\n"
+    code += "print(app_bundle.stage_app(pathlib.Path(sys.argv[1]), config.Config()))"
     environment = {**os.environ, "PYTHONPATH": str(alone.parent)}
     command = [sys.executable, "-c", code, str(tmp_path / "stage")]
     said = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout

@@ -157,8 +157,8 @@ def submit(deployment: Deployment, config: Config, timeout_s: float, watch: Call
     Raises:
         FlowerRunError: the run failed or timed out.
     """
-    app, settings = app_bundle.stage_app(deployment.folder), app_bundle.write_settings(deployment.folder, config)
-    run_id = deployment.link.submit(app, "--run-config", str(settings), timeout_s=timeout_s, watch=watch)
+    app = app_bundle.stage_app(deployment.folder, config)
+    run_id = deployment.link.submit(app, timeout_s=timeout_s, watch=watch)
     superlink.require_completed(deployment.link, run_id)
 
 

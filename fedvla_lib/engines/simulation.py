@@ -25,12 +25,11 @@ def run_simulation(config: Config, *, timeout_s: float = 24 * 3600.0) -> Path:
     config = check(replace(absolute(config), num_threads=config.num_threads or 1))
     before = run_folders(config)
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
-        app, settings = app_bundle.stage_app(Path(folder)), app_bundle.write_settings(Path(folder), config)
+        app = app_bundle.stage_app(Path(folder), config)
         with local_superlink(Path(folder), "--simulation") as link:
             federation = f"num-supernodes={config.num_clients} client-resources-num-cpus=1"
-            options = ["--federation-config", federation, "--run-config", str(settings)]
             for _ in range(RUNTIME_TRIES):
-                run_id = link.submit(app, *options, timeout_s=timeout_s)
+                run_id = link.submit(app, "--federation-config", federation, timeout_s=timeout_s)
                 if NOT_STARTED not in link.log.read_text(errors="replace"):
                     break
             require_completed(link, run_id)
