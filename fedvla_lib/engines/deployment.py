@@ -9,7 +9,7 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -64,6 +64,11 @@ class Deployment:
         if not _says(log, CONNECTED):  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
 
+    def kill_nodes(self) -> None:
+        """Kill the SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
+        for node in self.nodes.values():
+            processes.stop(node, (signal.SIGKILL,))
+
     def _command(self, partition_id: int) -> list[str]:
         node_config = f"partition-id={partition_id} num-partitions={self.num_clients}"
         if self.data:
@@ -100,26 +105,17 @@ def running_deployment(
     files = credentials.make_server(folder / "server") if tls else None
     keys = [credentials.make_node_key(folder / "keys", f"node_{k}") for k in range(num_clients)] if auth else []
     options = ["--enable-supernode-auth"] if auth else []
-    nodes: dict[int, subprocess.Popen] = {}
-    try:
-        with superlink.local_superlink(folder, *options, files=files) as link:
-            deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients, nodes)
-            for k in range(num_clients):  # the next is registered while this one starts
-                if auth:
-                    link.ask("supernode", "register", str(keys[k].public), CONNECTION)
-                deployment.launch_node(k)
-            for k in range(num_clients):
-                deployment.wait_for_node(k)
-            yield deployment
-            _kill(nodes)  # before the SuperLink, which would wait for their connections to end
-    finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
-        _kill(nodes)
-
-
-def _kill(nodes: dict[int, subprocess.Popen]) -> None:
-    """Kill SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
-    for node in nodes.values():
-        processes.stop(node, (signal.SIGKILL,))
+    with ExitStack() as last, superlink.local_superlink(folder, *options, files=files) as link:
+        deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients)
+        last.callback(deployment.kill_nodes)  # after the SuperLink: an interrupted run must not see its clients fail
+        for k in range(num_clients):  # the next is registered while this one starts
+            if auth:
+                link.ask("supernode", "register", str(keys[k].public), CONNECTION)
+            deployment.launch_node(k)
+        for k in range(num_clients):
+            deployment.wait_for_node(k)
+        yield deployment
+        deployment.kill_nodes()  # before the SuperLink, which would wait for their connections to end
 
 
 def run_deployed(

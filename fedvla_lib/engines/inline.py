@@ -9,9 +9,9 @@ import itertools
 import logging
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -65,9 +65,12 @@ def run_inline(
     run_config = to_run_config(check(config))
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
     claim_identity()
-    with _quiet_flower(), processes(jobs) if jobs > 1 else nullcontext() as pool:
+    flower = logging.getLogger("flwr")
+    with ExitStack() as stack:
+        stack.callback(flower.setLevel, flower.level)
+        flower.setLevel(logging.WARNING)  # without its info log; the run folder has the same events
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
-        grid.pool = pool
+        grid.pool = stack.enter_context(processes(jobs)) if jobs > 1 else None
         server_app.build(loaders, engine="inline", progress=progress, jobs=jobs)(grid, context)
     return Path(context.state["run"]["folder"])
 
@@ -196,15 +199,3 @@ def _in_worker(message: Message, context: Context) -> tuple[Message, Context, fl
 def claim_identity() -> None:
     """Set the identity of this process for Flower's message class, as Flower's runtimes do before they start an app."""
     TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SUPERLINK_NODE_ID, 0
-
-
-@contextmanager
-def _quiet_flower() -> Iterator[None]:
-    """Suppress Flower's info log; the run folder has the same events."""
-    flower = logging.getLogger("flwr")
-    before = flower.level
-    flower.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        flower.setLevel(before)
