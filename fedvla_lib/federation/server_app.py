@@ -19,7 +19,7 @@ from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.client import LOADERS, Loaders
-from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
 from fedvla_lib.federation.throttled_grid import for_runtime
@@ -73,7 +73,10 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     states = grid if isinstance(grid, ClientStates) else None
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
-    roster, weights, pooled = _introduce(grid, config, run)
+    roster = _introduce(grid, config, run)
+    total = sum(roster.examples_of.values())
+    weights = {node: examples / total for node, examples in roster.examples_of.items()}
+    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
@@ -165,23 +168,18 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     return found
 
 
-def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
-    """Ask clients for partition, frame count and statistics; none of their other data leaves them.
-
-    Returns the roster, each node's share of all frames, and the pooled statistics.
-    """
+def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
+    """Ask clients for partition, frame count and statistics; none of their other data leaves them."""
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    roster, introductions = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
-    if len(introductions) < config.min_replies:
+    roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
+    if len(roster.nodes) < config.min_replies:
         raise TooFewReplies(
-            f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
+            f"{len(roster.nodes)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
             "required; the rejected ones are in metrics.jsonl"
         )
-    for one in introductions if not config.resume else []:
-        run.log(0, client_name(one.partition_id), "data", {"num_examples": one.num_examples})
-    total = sum(roster.examples_of.values())
-    weights = {node: examples / total for node, examples in roster.examples_of.items()}
-    return roster, weights, normalisation.pool_stats([one.stats for one in introductions])
+    for node in roster.nodes if not config.resume else []:
+        run.log(0, roster.name(node), "data", {"num_examples": roster.examples_of[node]})
+    return roster
 
 
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: messages.Rollouts) -> None:
