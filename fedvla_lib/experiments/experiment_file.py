@@ -26,6 +26,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -106,14 +107,13 @@ def _check_types(content: dict[str, Any], file: Path) -> None:
 
 
 def _cells(content: dict[str, Any], file: Path) -> Iterator[Cell]:
-    for seed in content["seeds"]:
-        for partition, of_partition in content["partitions"].items():
-            for method, of_method in content["methods"].items():
-                own = dict(of_method)
-                kind = own.pop("kind", "federated")
-                if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
-                    raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
-                if kind not in KINDS:
-                    raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
-                settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))
+    partitions, methods = content["partitions"].items(), content["methods"].items()
+    for seed, (partition, of_partition), (method, of_method) in product(content["seeds"], partitions, methods):
+        own = dict(of_method)
+        kind = own.pop("kind", "federated")
+        if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
+            raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
+        if kind not in KINDS:
+            raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
+        settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
+        yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))
