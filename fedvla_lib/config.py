@@ -118,11 +118,6 @@ def task_names(config: Config) -> list[str]:
     return split_names(config.tasks)
 
 
-def personal_parts(config: Config) -> list[str]:
-    """Return `config.personal` as a list."""
-    return split_names(config.personal)
-
-
 def split_names(names: str) -> list[str]:
     """Return names that are separated by commas as a list."""
     return [name.strip() for name in names.split(",") if name.strip()]

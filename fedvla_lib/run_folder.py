@@ -17,7 +17,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -84,15 +84,12 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
             write_json(root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
 
 
-@contextmanager
-def hold(root: Path) -> Iterator[None]:
-    """Lock a run folder for writing; raise ValueError if another process holds the lock."""
+def hold(root: Path) -> AbstractContextManager:
+    """Lock a run folder for writing until the end of a block; raise ValueError if another process holds the lock."""
     try:
-        lock = FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S).acquire()
+        return FileLock(root / LOCK, timeout=LOCK_TIMEOUT_S).acquire()
     except Timeout as error:
         raise ValueError(f"{root} is in use: another process still writes to it") from error
-    with lock:
-        yield
 
 
 def is_held(root: Path) -> bool:
@@ -122,7 +119,11 @@ def _existing(root: Path) -> Path:
 
 
 def resumable(root: Path, config: Config) -> dict[str, Any]:
-    """Return the stamp of a run that can be resumed; ValueError if it is none, is completed, or has other settings."""
+    """Return the stamp of a run that can be resumed with these settings.
+
+    Raises:
+        ValueError: not a run folder, a completed run, or a run with other settings.
+    """
     stamp, saved = read_stamp(_existing(root)), read_config(root)
     if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to resume")

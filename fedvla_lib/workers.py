@@ -10,10 +10,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
-from graphlib import TopologicalSorter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from typing import Any
 
 import psutil
@@ -35,12 +34,7 @@ def default_jobs() -> int:
 
 
 def side_by_side(
-    function: Callable[[Any], Any],
-    items: Sequence[Hashable],
-    jobs: int,
-    *,
-    after: Mapping[Any, Iterable] | None = None,
-    preload: Sequence[str] = HEAVY,
+    function: Callable[[Any], Any], items: Sequence[Any], jobs: int, preload: Sequence[str] = HEAVY
 ) -> Iterator[tuple[Any, Any]]:
     """Yield (item, result) for each item, as they complete; with one job in this process, one after the other.
 
@@ -48,39 +42,28 @@ def side_by_side(
         function: of one item; with several jobs both are pickled, so `function` stands in a module.
         items: the earlier ones start first.
         jobs: processes at most.
-        after: by item, other items that must be complete before it starts.
         preload: modules that the processes share, imported once.
 
     Raises:
         Exception: what `function` raised, at once; pieces of work that still run are ended.
     """
-    order = TopologicalSorter({item: set((after or {}).get(item, ())) & set(items) for item in items})
-    order.prepare()
-    jobs, ready, running = min(jobs, len(items)), [], {}
+    if min(jobs, len(items)) <= 1:
+        yield from ((item, function(item)) for item in items)
+        return
     # Pickled here: PyTorch would put a policy's arrays into shared memory, which goes wrong between two forks.
-    work = pickle.dumps(function) if jobs > 1 else b""
-    with processes(jobs, preload) if jobs > 1 else nullcontext() as pool:
-        while order.is_active():
-            ready = sorted([*ready, *order.get_ready()], key=items.index)
-            while ready and len(running) < max(1, jobs):
-                item = ready.pop(0)
-                running[pool.submit(_unpickled, work, item) if pool else _here(function, item)] = item
+    work, waiting, running = pickle.dumps(function), list(items), {}
+    with processes(min(jobs, len(items)), preload) as pool:
+        while waiting or running:
+            while waiting and len(running) < jobs:  # no more: results that are not yet taken stay in memory
+                item = waiting.pop(0)
+                running[pool.submit(_unpickled, work, item)] = item
             for done in wait(running, return_when=FIRST_COMPLETED).done:
-                item = running.pop(done)
-                yield item, done.result()
-                order.done(item)
+                yield running.pop(done), done.result()
 
 
 def _unpickled(function: bytes, item: Any) -> Any:
     """Call a pickled function in a worker process."""
     return pickle.loads(function)(item)
-
-
-def _here(function: Callable[[Any], Any], item: Any) -> Future:
-    """Call the function in this process."""
-    done: Future = Future()
-    done.set_result(function(item))
-    return done
 
 
 @contextmanager

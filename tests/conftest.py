@@ -52,8 +52,8 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
 
     stage = app_bundle.stage_app
 
-    def stage_faulty(folder: Path) -> Path:
-        app = stage(folder)
+    def stage_faulty(folder: Path, config) -> Path:
+        app = stage(folder, config)
         shutil.copy(Path(__file__).with_name("faulty.py"), app)
         project = app / "pyproject.toml"
         told = project.read_text().replace("fedvla_lib.federation.client_app:app", "faulty:app")

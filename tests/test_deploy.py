@@ -94,14 +94,16 @@ def test_a_node_with_an_unknown_key_is_refused(standing, tmp_path):
     stranger = credentials.make_node_key(tmp_path, "stranger")
     intruder = replace(standing, keys=[stranger, stranger], nodes={}, folder=tmp_path)
     with pytest.raises(processes.FlowerRunError, match=r"SuperNode of client 0 ended with status [1-9]"):
-        intruder.start_node(0)
+        intruder.launch_node(0)
+        intruder.wait_for_node(0)
     assert deployment.CONNECTED not in intruder.log(0).read_text()
 
 
 def refusal(node_of: deployment.Deployment) -> str:
     """Start a SuperNode of the deployment, which must reject the server at once, and return its log."""
     with pytest.raises(processes.FlowerRunError, match="the SuperNode of client 0 does not trust the SuperLink"):
-        node_of.start_node(0)
+        node_of.launch_node(0)
+        node_of.wait_for_node(0)
     processes.stop(node_of.nodes[0])
     return node_of.log(0).read_text()
 
@@ -137,6 +139,19 @@ def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deploymen
     assert_faults_were_survived(max(run_folder.run_folders(tiny)), tiny)
 
 
+def start_again(here: deployment.Deployment, partition_id: int) -> None:
+    """Start a killed SuperNode, as a service manager would: its key is refused until the SuperLink misses the old."""
+    deadline = time.monotonic() + processes.STARTUP_S
+    while True:
+        here.launch_node(partition_id)
+        try:
+            return here.wait_for_node(partition_id)
+        except processes.FlowerRunError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1)
+
+
 def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(standing, tiny):
     """Killed after round 1 and restarted with its key once a round has run without it."""
     config = replace(tiny, num_server_rounds=5, local_steps=2)
@@ -146,11 +161,11 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
         begun = [folder for folder in run_folder.run_folders(config) if (folder / "metrics.jsonl").exists()]
         kinds = {event["kind"] for folder in begun for event in run_folder.read_events(folder)}
         if "train" in kinds and not happened:
-            standing.kill_node(1)
+            processes.stop(standing.nodes.pop(1), (signal.SIGKILL,))  # as a power cut would
             happened.append("killed")
         if "rejected" in kinds and happened == ["killed"]:
             happened.append("started again")
-            standing.start_node(1)
+            start_again(standing, 1)
 
     deployment.submit(standing, config, 900, meddle)
     root = max(run_folder.run_folders(config))
@@ -290,7 +305,7 @@ def written_commands(program: str) -> list[list[str]]:
 @pytest.mark.unit
 @pytest.mark.parametrize("program", ["flower-superlink", "flower-supernode"])
 def test_flowers_programs_know_the_flags_of_the_recipe(program):
-    command = [processes.program(program), "--help"]
+    command = [Path(sys.executable).with_name(program), "--help"]
     help_text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     used = [{word for word in words if word.startswith("--")} for words in written_commands(program)]
     assert len(used) >= 2 and all(flags for flags in used)

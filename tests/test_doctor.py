@@ -67,7 +67,7 @@ def test_video_comes_back():
 
 
 def test_unknown_codec_is_a_failure():
-    check = doctor.check_video(["no-such-codec"])
+    check = doctor.check_video("no-such-codec")
     assert not check.ok and "no-such-codec" in check.found and check.fix
 
 

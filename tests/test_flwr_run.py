@@ -94,21 +94,22 @@ def test_a_run_that_fails_is_status_2_and_a_line_with_flowers_reason(tiny, capsy
 
 
 @pytest.mark.unit
-def test_the_staged_app_holds_the_library_and_its_settings_parse(tiny, tmp_path):
-    app = app_bundle.stage_app(tmp_path / "stage")
+def test_the_staged_app_holds_the_library_and_the_settings_of_the_run(tiny, tmp_path):
+    app = app_bundle.stage_app(tmp_path / "stage", tiny)
     assert (app / "fedvla_lib/federation/server_app.py").is_file()
     assert not list(app.rglob("__pycache__"))
-    settings = app_bundle.write_settings(tmp_path, tiny).read_text()
-    assert from_run_config(tomllib.loads(settings)) == tiny
+    project = tomllib.loads((app / "pyproject.toml").read_text())
+    assert from_run_config(project["tool"]["flwr"]["app"]["config"]) == tiny
 
 
 @pytest.mark.unit
 def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
-    """As from a wheel: only the folder of the package."""
+    """As from a wheel: only the folder of the package; a stranger's project file beside it is not taken."""
     package = PYPROJECT.parent / "fedvla_lib"
     alone = shutil.copytree(package, tmp_path / "site/fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
-    code = "import pathlib, sys; from fedvla_lib.engines import app_bundle\n"
-    code += "print(app_bundle.stage_app(pathlib.Path(sys.argv[1])))"
+    (alone.parent / "pyproject.toml").write_text('[project]\nname = "another"\n')
+    code = "import pathlib, sys; from fedvla_lib import config; from fedvla_lib.engines import app_bundle\n"
+    code += "print(app_bundle.stage_app(pathlib.Path(sys.argv[1]), config.Config()))"
     environment = {**os.environ, "PYTHONPATH": str(alone.parent)}
     command = [sys.executable, "-c", code, str(tmp_path / "stage")]
     said = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
@@ -119,9 +120,3 @@ def test_an_installed_library_stages_the_same_app_without_a_checkout(tmp_path):
     with ZipFile(BytesIO(build_fab_from_disk(app))) as bundle:
         wanted = {f"fedvla_lib/{path.relative_to(package)}" for path in package.rglob("*.py")}
         assert wanted <= set(bundle.namelist())
-
-
-@pytest.mark.unit
-def test_a_strangers_project_file_beside_the_package_is_not_taken(tmp_path):
-    (tmp_path / "pyproject.toml").write_text('[project]\nname = "another"\n')
-    assert not app_bundle._is_checkout(tmp_path) and app_bundle._is_checkout(PYPROJECT.parent)

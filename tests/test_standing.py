@@ -71,7 +71,7 @@ def run_app(connection, config, *options):
     usual = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["flwr"]["app"]["config"]
     told = {name: value for name, value in to_run_config(config).items() if value != usual[name]}
     words = " ".join(f"{name}={json.dumps(value)}" for name, value in told.items())
-    command = [processes.program("flwr"), "run", str(ROOT), connection, "--stream", "--run-config", words, *options]
+    command = ["flwr", "run", str(ROOT), connection, "--stream", "--run-config", words, *options]
     environment = superlink.flower_environment(Path(os.environ["FLWR_HOME"]))
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=540)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -491,12 +491,14 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     reason, said = INTRODUCTIONS[fault]
     events = Events()
     grid = InlineGrid(introducing([0, 1, 2], **said), 3, {})
-    roster, introductions = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
-    assert [one.partition_id for one in introductions] == [0, 2] and sorted(roster.partition_of.values()) == [0, 2]
+    roster = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
+    kept = [FIRST_NODE_ID, FIRST_NODE_ID + 2]
+    assert roster.nodes == kept and roster.partition_of == dict(zip(kept, [0, 2], strict=True))
+    assert sorted(roster.stats_of) == sorted(roster.examples_of) == kept
     assert events.rejected() == {f"node_{FIRST_NODE_ID + 1}": reason}
     detail = events[0][3]["detail"]
     assert "\n" not in detail and (reason == "partition" or detail.startswith("client_1: "))
-    pooled = normalisation.pool_stats([one.stats for one in introductions])
+    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
     assert pooled["action"]["count"].tolist() == [5 + 7]
     np.testing.assert_array_equal(pooled["action"]["std"], np.ones(6))
 
@@ -511,15 +513,14 @@ def test_joints_that_never_move_can_be_pooled(value):
 
     events = Events()
     grid = InlineGrid(introducing(range(60), stats_of), 60, {})
-    assert len(introduce_nodes(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0)[1]) == 60 and not events
+    assert len(introduce_nodes(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0).nodes) == 60 and not events
 
 
 def test_introductions_are_ordered_by_partition_and_a_duplicate_is_rejected():
     events = Events()
     grid = InlineGrid(introducing([2, 0, 2, 1]), 4, {})
-    roster, introductions = introduce_nodes(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)
-    assert [one.partition_id for one in introductions] == [0, 1, 2]
-    assert sorted(roster.partition_of.values()) == [0, 1, 2]
+    roster = introduce_nodes(grid, wait_for_nodes(grid, 4, 1.0), events.log, 1.0)
+    assert [roster.partition_of[node] for node in roster.nodes] == [0, 1, 2]
     assert list(events.rejected().values()) == ["partition"]
 
 

@@ -1,4 +1,4 @@
-"""Work side by side: results as in one process, what others need first, and nothing left after an error or Ctrl-C."""
+"""Work side by side: results as in one process, and nothing left after an error or Ctrl-C."""
 
 import os
 import signal
@@ -42,11 +42,10 @@ def shifted(weights: torch.Tensor, number: int) -> float:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_every_item_has_its_result_and_comes_after_those_it_needs(jobs):
-    found = dict(workers.side_by_side(square, list(range(5)), jobs, after={0: [4], 1: [0]}))
+def test_every_item_has_its_result(jobs):
+    found = dict(workers.side_by_side(square, list(range(5)), jobs))
     assert {item: result[0] for item, result in found.items()} == {i: i * i for i in range(5)}
-    order = list(found)
-    assert order.index(4) < order.index(0) < order.index(1)
+    assert jobs > 1 or list(found) == list(range(5))
     processes = {result[1] for result in found.values()}
     assert (processes == {os.getpid()}) == (jobs == 1) and len(processes) == jobs
     assert jobs == 1 or {result[2:] for result in found.values()} == {(1, "1")}

@@ -11,9 +11,12 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +27,7 @@ from papermill.exceptions import PapermillExecutionError
 
 import status
 from fedvla_lib.config import PROFILES
-from fedvla_lib.workers import side_by_side
+from fedvla_lib.workers import processes
 
 PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
@@ -210,10 +213,36 @@ def execute_chapters(
     first = sorted(changed, key=lambda path: not any(path in others for others in needed.values()))
     work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs)
     order = first if jobs > 1 else changed[::-1]
-    for path, chapter in side_by_side(work, order, jobs, after=needed, preload=()):
+    for path, chapter in _one_after_another(work, order, jobs, needed):
         chapters[path] = chapter
         print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
+
+
+def _one_after_another(
+    work: Callable[[Path], Chapter], notebooks: list[Path], jobs: int, needed: dict[Path, set[Path]]
+) -> Iterator[tuple[Path, Chapter]]:
+    """Yield each notebook and its chapter as they complete, `jobs` at a time, each after those that it needs."""
+    order = TopologicalSorter({path: needed[path] & set(notebooks) for path in notebooks})
+    order.prepare()
+    jobs, ready, running = min(jobs, len(notebooks)), [], {}
+    with processes(jobs, preload=()) if jobs > 1 else nullcontext() as pool:
+        while order.is_active():
+            ready = sorted([*ready, *order.get_ready()], key=notebooks.index)
+            while ready and len(running) < max(1, jobs):
+                path = ready.pop(0)
+                running[pool.submit(work, path) if pool else _here(work, path)] = path
+            for done in wait(running, return_when=FIRST_COMPLETED).done:
+                path = running.pop(done)
+                yield path, done.result()
+                order.done(path)
+
+
+def _here(work: Callable[[Path], Chapter], notebook: Path) -> Future:
+    """Execute a notebook in this process."""
+    done: Future = Future()
+    done.set_result(work(notebook))
+    return done
 
 
 def _announced(place: dict[Path, str], notebook: Path, profile: str, **options: Any) -> Chapter:

@@ -124,7 +124,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
-    """Return the settings of a new run, or of the run to resume; raise ValueError if it cannot, or not with them."""
+    """Return the settings of a new run, or of the interrupted run to resume.
+
+    Raises:
+        ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
+    """
     from fedvla_lib.run_folder import hold, read_config, resumable
 
     if not options.resume:
@@ -248,7 +252,10 @@ def compare(options: argparse.Namespace) -> None:
     if differ and not options.allow_mismatch:
         raise ValueError(f"not comparable: {'; '.join(differ)} (--allow-mismatch compares what they have in common)")
     intervals = {"seed": options.seed, "confidence": options.confidence}
-    tables = {name: getattr(compare_runs, name)(runs, metrics, **intervals) for name in ("values", "differences")}
+    tables = {
+        "values": compare_runs.values(runs, metrics, **intervals),
+        "differences": compare_runs.differences(runs, metrics, **intervals),
+    }
     for line in differ:
         print(f"MISMATCH: {line}")
     for table in tables.values():
@@ -283,7 +290,11 @@ def videos(options: argparse.Namespace) -> int:
 
 
 def _saved_settings(folder: Path) -> Config:
-    """Return settings that load the policy saved in `folder` as it was trained."""
+    """Return settings that load the policy saved in `folder` as it was trained.
+
+    Raises:
+        ValueError: not a pretrained_model folder, or a policy without our cameras.
+    """
     if not (file := folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
     saved = json.loads(file.read_text())

@@ -8,9 +8,8 @@ import json
 import signal
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -43,48 +42,32 @@ class Deployment:
         """Return the path of a node's log."""
         return self.folder / f"node_{partition_id}" / "supernode.log"
 
-    def start_node(self, partition_id: int) -> None:
-        """Start the SuperNode of a client and wait until the SuperLink has accepted it.
+    def launch_node(self, partition_id: int) -> None:
+        """Start the SuperNode of a client with a new log, and do not wait."""
+        log = self.log(partition_id)
+        log.parent.mkdir(exist_ok=True)
+        log.unlink(missing_ok=True)
+        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
+        self.nodes[partition_id] = processes.start(self._command(partition_id), environment, log)
 
-        A SuperLink rejects a key until it notices that the previous node with that key is gone, so a restart is retried
-        for up to two minutes, as a service manager would.
+    def wait_for_node(self, partition_id: int) -> None:
+        """Wait until the SuperLink has accepted a SuperNode.
+
+        A SuperLink rejects a key until it notices that the previous node with that key is gone, so whoever restarts a
+        node has to try again for up to two minutes, as service managers do.
 
         Raises:
             FlowerRunError: the SuperLink rejected it, it rejected the SuperLink, or could not connect; with its log.
         """
-        was_connected = _count(self.log(partition_id)) > 0
-        deadline = time.monotonic() + processes.STARTUP_S
-        while True:
-            try:
-                return self._try_node(partition_id)
-            except FlowerRunError:
-                if not was_connected or time.monotonic() > deadline:
-                    raise
-                time.sleep(superlink.POLL_S)
-
-    def _try_node(self, partition_id: int) -> None:
-        log = self.log(partition_id)
-        before = _count(log), _count(log, UNTRUSTED)
-        self.launch_node(partition_id)
-        self.wait_for_node(partition_id, *before)
-
-    def launch_node(self, partition_id: int) -> None:
-        """Start the SuperNode of a client, and do not wait."""
-        log = self.log(partition_id)
-        log.parent.mkdir(exist_ok=True)
-        environment = {**self.link.environment, "FLWR_HOME": str(log.parent)}
-        self.nodes[partition_id] = processes.start(self._command(partition_id), environment, log)
-
-    def wait_for_node(self, partition_id: int, connected: int = 0, untrusted: int = 0) -> None:
-        """Wait until a SuperNode's log says more often than before that it was accepted, as `start_node` does."""
         node, log, who = self.nodes[partition_id], self.log(partition_id), f"the SuperNode of client {partition_id}"
-        processes.wait_until(lambda: _count(log) > connected or _count(log, UNTRUSTED) > untrusted, node, log, who)
-        if _count(log) == connected:  # it would retry forever
+        processes.wait_until(lambda: _says(log, CONNECTED) or _says(log, UNTRUSTED), node, log, who)
+        if not _says(log, CONNECTED):  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
 
-    def kill_node(self, partition_id: int) -> None:
-        """Kill a SuperNode and its child processes without warning, as a power cut would."""
-        processes.stop(self.nodes.pop(partition_id), (signal.SIGKILL,))
+    def kill_nodes(self) -> None:
+        """Kill the SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
+        for node in self.nodes.values():
+            processes.stop(node, (signal.SIGKILL,))
 
     def _command(self, partition_id: int) -> list[str]:
         node_config = f"partition-id={partition_id} num-partitions={self.num_clients}"
@@ -122,26 +105,17 @@ def running_deployment(
     files = credentials.make_server(folder / "server") if tls else None
     keys = [credentials.make_node_key(folder / "keys", f"node_{k}") for k in range(num_clients)] if auth else []
     options = ["--enable-supernode-auth"] if auth else []
-    nodes: dict[int, subprocess.Popen] = {}
-    try:
-        with superlink.local_superlink(folder, *options, files=files) as link:
-            deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients, nodes)
-            for k in range(num_clients):  # the next is registered while this one starts
-                if auth:
-                    link.ask("supernode", "register", str(keys[k].public), CONNECTION)
-                deployment.launch_node(k)
-            for k in range(num_clients):
-                deployment.wait_for_node(k)
-            yield deployment
-            _kill(nodes)  # before the SuperLink, which would wait for their connections to end
-    finally:  # after the SuperLink: a run that is interrupted must not see its clients fail first
-        _kill(nodes)
-
-
-def _kill(nodes: dict[int, subprocess.Popen]) -> None:
-    """Kill SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
-    for node in nodes.values():
-        processes.stop(node, (signal.SIGKILL,))
+    with ExitStack() as last, superlink.local_superlink(folder, *options, files=files) as link:
+        deployment = Deployment(link, folder, [Path(path).resolve() for path in data], keys, num_clients)
+        last.callback(deployment.kill_nodes)  # after the SuperLink: an interrupted run must not see its clients fail
+        for k in range(num_clients):  # the next is registered while this one starts
+            if auth:
+                link.ask("supernode", "register", str(keys[k].public), CONNECTION)
+            deployment.launch_node(k)
+        for k in range(num_clients):
+            deployment.wait_for_node(k)
+        yield deployment
+        deployment.kill_nodes()  # before the SuperLink, which would wait for their connections to end
 
 
 def run_deployed(
@@ -179,8 +153,8 @@ def submit(deployment: Deployment, config: Config, timeout_s: float, watch: Call
     Raises:
         FlowerRunError: the run failed or timed out.
     """
-    app, settings = app_bundle.stage_app(deployment.folder), app_bundle.write_settings(deployment.folder, config)
-    run_id = deployment.link.submit(app, "--run-config", str(settings), timeout_s=timeout_s, watch=watch)
+    app = app_bundle.stage_app(deployment.folder, config)
+    run_id = deployment.link.submit(app, timeout_s=timeout_s, watch=watch)
     superlink.require_completed(deployment.link, run_id)
 
 
@@ -206,5 +180,5 @@ def _events(config: Config, before: set[Path]) -> list[dict[str, Any]]:
     return run_folder.read_events(root) if root and (root / run_folder.METRICS_FILE).is_file() else []
 
 
-def _count(log: Path, text: str = CONNECTED) -> int:
-    return log.read_text(errors="replace").count(text) if log.exists() else 0
+def _says(log: Path, text: str) -> bool:
+    return text in log.read_text(errors="replace")

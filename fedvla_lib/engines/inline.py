@@ -9,9 +9,10 @@ import itertools
 import logging
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from flwr.app import Context, Error, Message, RecordDict, UserConfig
@@ -64,10 +65,13 @@ def run_inline(
     run_config = to_run_config(check(config))
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), run_config)
     claim_identity()
-    with _quiet_flower(), processes(jobs) if jobs > 1 else nullcontext() as pool:
+    flower = logging.getLogger("flwr")
+    with ExitStack() as stack:
+        stack.callback(flower.setLevel, flower.level)
+        flower.setLevel(logging.WARNING)  # without its info log; the run folder has the same events
         grid = InlineGrid(app, config.num_clients, run_config, data, progress=progress, raise_errors=raise_errors)
-        grid.pool = pool
-        server_app.build(loaders, engine="inline", progress=progress, states=grid, jobs=jobs)(grid, context)
+        grid.pool = stack.enter_context(processes(jobs)) if jobs > 1 else None
+        server_app.build(loaders, engine="inline", progress=progress, jobs=jobs)(grid, context)
     return Path(context.state["run"]["folder"])
 
 
@@ -131,10 +135,8 @@ class InlineGrid(Grid):
         contexts = [self._contexts[message.metadata.dst_node_id] for message in ordered]
         for message in ordered:
             message.metadata.__dict__["_message_id"] = str(next(self._ids))  # replies refer to it, as on Flower's grids
-        if self.pool:
-            handled = self.pool.map(_in_worker, ordered, contexts)
-        else:
-            handled = (_handle(self._app, *each, self._raise_errors) for each in zip(ordered, contexts, strict=True))
+        here = partial(_handle, self._app, raise_errors=self._raise_errors)
+        handled = self.pool.map(_in_worker, ordered, contexts) if self.pool else map(here, ordered, contexts)
         bar = tqdm(handled, total=len(ordered), desc=f"clients: {kind}", disable=not (self._progress and ordered),
                    leave=False)  # fmt: skip
         for message, (reply, context, seconds) in zip(ordered, bar, strict=True):
@@ -197,15 +199,3 @@ def _in_worker(message: Message, context: Context) -> tuple[Message, Context, fl
 def claim_identity() -> None:
     """Set the identity of this process for Flower's message class, as Flower's runtimes do before they start an app."""
     TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SUPERLINK_NODE_ID, 0
-
-
-@contextmanager
-def _quiet_flower() -> Iterator[None]:
-    """Suppress Flower's info log; the run folder has the same events."""
-    flower = logging.getLogger("flwr")
-    before = flower.level
-    flower.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        flower.setLevel(before)

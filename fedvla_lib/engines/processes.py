@@ -5,7 +5,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -24,8 +23,7 @@ class FlowerRunError(RuntimeError):
 def start(
     command: list[str], environment: dict[str, str], log: Path, stdin: socket.socket | None = None
 ) -> subprocess.Popen:
-    """Start a program in a new session, so that `stop` also ends its child processes."""
-    command = [program(command[0]), *command[1:]]
+    """Start a program of the environment's PATH in a new session, so that `stop` also ends its child processes."""
     with open(log, "ab") as output:
         return subprocess.Popen(
             command, env=environment, stdin=stdin, stdout=output, stderr=output, start_new_session=True
@@ -68,12 +66,6 @@ def stop(
     for descendant in descendants:
         with suppress(psutil.NoSuchProcess):
             descendant.kill()
-
-
-def program(name: str) -> str:
-    """Return the path of a command installed next to this interpreter, which need not be on PATH; else its name."""
-    path = Path(sys.executable).parent / name
-    return str(path) if path.exists() else name
 
 
 def is_free(port: int) -> bool:

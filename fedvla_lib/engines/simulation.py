@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fedvla_lib.config import Config, absolute, check
 from fedvla_lib.engines import app_bundle
-from fedvla_lib.engines.superlink import SuperLink, local_superlink, require_completed
+from fedvla_lib.engines.superlink import local_superlink, require_completed
 from fedvla_lib.run_folder import own_run, run_folders
 
 # Ray 2.55 has hard-coded start-up timeouts (30 s for its server and raylet, 15 s for the raylet's helpers). A busy
@@ -25,18 +25,12 @@ def run_simulation(config: Config, *, timeout_s: float = 24 * 3600.0) -> Path:
     config = check(replace(absolute(config), num_threads=config.num_threads or 1))
     before = run_folders(config)
     with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
-        app, settings = app_bundle.stage_app(Path(folder)), app_bundle.write_settings(Path(folder), config)
+        app = app_bundle.stage_app(Path(folder), config)
         with local_superlink(Path(folder), "--simulation") as link:
             federation = f"num-supernodes={config.num_clients} client-resources-num-cpus=1"
-            options = ["--federation-config", federation, "--run-config", str(settings)]
-            require_completed(link, _submit(link, app, options, timeout_s))
+            for _ in range(RUNTIME_TRIES):
+                run_id = link.submit(app, "--federation-config", federation, timeout_s=timeout_s)
+                if NOT_STARTED not in link.log.read_text(errors="replace"):
+                    break
+            require_completed(link, run_id)
     return own_run(config, before)
-
-
-def _submit(link: SuperLink, app: Path, options: list[str], timeout_s: float) -> str:
-    """Run the app, retrying if Flower's runtime did not start, and return the id of the last run."""
-    for _ in range(RUNTIME_TRIES):
-        run_id = link.submit(app, *options, timeout_s=timeout_s)
-        if NOT_STARTED not in link.log.read_text(errors="replace"):
-            break
-    return run_id

@@ -6,7 +6,6 @@ Flower's own `flwr run` gives the SuperLink that it starts only 15 s, and exits 
 import json
 import os
 import re
-import shutil
 import ssl
 import subprocess
 import sys
@@ -52,7 +51,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the run was not accepted or timed out.
         """
-        command = [self._flwr(), "run", str(app), self.connection, *options, "--stream"]
+        command = ["flwr", "run", str(app), self.connection, *options, "--stream"]
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
@@ -72,7 +71,7 @@ class SuperLink:
         Raises:
             FlowerRunError: the command failed.
         """
-        arguments = [self._flwr(), *command, "--format", "json"]
+        arguments = ["flwr", *command, "--format", "json"]
         done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         if "{\n" not in done.stdout:
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(done.stderr or done.stdout)}")
@@ -80,9 +79,6 @@ class SuperLink:
         if not answer.get("success", True):
             raise FlowerRunError(f"flwr {command[0]} failed: {one_line(answer.get('error-message', done.stdout))}")
         return answer
-
-    def _flwr(self) -> str:
-        return shutil.which("flwr", path=self.environment["PATH"]) or "flwr"
 
 
 @contextmanager

@@ -7,8 +7,8 @@ LeRobot, which takes eight seconds. Nothing depends on this module: without it, 
 import json
 import os
 import shlex
+import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -42,9 +42,12 @@ def warm_start(environment: dict[str, str], log: Path) -> Iterator[dict[str, str
             return
         for number, (programs, modules) in enumerate(SERVERS.items()):
             address = os.path.join(folder, f"socket-{number}")
-            server = _start_server(address, modules, environment, log)
-            running.callback(processes.stop, server)
-            _write_stand_ins(Path(folder), programs, address)
+            command = [sys.executable, "-P", str(FORK_SERVER), "serve", *modules]
+            with socket.socket(socket.AF_UNIX) as listener:  # calls wait in its queue until the modules are loaded
+                listener.bind(address)
+                listener.listen(128)
+                running.callback(processes.stop, processes.start(command, environment, log, listener))
+            _write_stand_ins(Path(folder), programs, address, environment["PATH"])
         path = os.pathsep.join([folder, environment["PATH"]])
         yield {**environment, **ray_python(os.path.join(folder, PYTHON)), "PATH": path}
 
@@ -55,18 +58,10 @@ def ray_python(python: str) -> dict[str, str]:
     return {"RAY_JOB_CONFIG_JSON_ENV_VAR": json.dumps({"runtime_env": {"py_executable": shlex.quote(python)}})}
 
 
-def _start_server(address: str, modules: Sequence[str], environment: dict[str, str], log: Path) -> subprocess.Popen:
-    """Start a fork server; calls wait in the queue of its socket until it has loaded the modules."""
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(address)
-        listener.listen(128)
-        return processes.start([sys.executable, "-P", str(FORK_SERVER), "serve", *modules], environment, log, listener)
-
-
-def _write_stand_ins(folder: Path, programs: Sequence[str], address: str) -> None:
-    """Write a script for each program that has a fork server run it."""
+def _write_stand_ins(folder: Path, programs: Sequence[str], address: str, path: str) -> None:
+    """Write a script for each program on `path` that has a fork server run it."""
     call = [sys.executable, "-IS", str(FORK_SERVER), "call", address]  # without site-packages: faster
     for name in programs:
-        command = shlex.join(call if name == PYTHON else [*call, processes.program(name)])
+        command = shlex.join(call if name == PYTHON else [*call, shutil.which(name, path=path) or name])
         (folder / name).write_text(f'#!/bin/sh\nexec {command} "$@"\n')
         (folder / name).chmod(0o700)

@@ -43,14 +43,15 @@ def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print, jobs: in
     out.mkdir(parents=True, exist_ok=True)
     todo = [cell for cell in plan.cells if not (out / cell.name).exists()]
     say(f"{len(plan.cells)} cells, {len(plan.cells) - len(todo)} of them in {out}")
-    measured = side_by_side(partial(_timed, seeds=plan.rollout_seeds, out=out), todo, jobs)
+    measured = side_by_side(partial(_timed, measure_cell, seeds=plan.rollout_seeds, out=out), todo, jobs)
     for number, (cell, (rate, seconds)) in enumerate(measured, 1):
         say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {seconds:.0f} s")
 
 
-def _timed(cell: Cell, seeds: Sequence[int], out: Path) -> tuple[float, float]:
+def _timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, float]:
+    """Return what a function returns, and the seconds that it took."""
     began = time.perf_counter()
-    return measure_cell(cell, seeds, out), time.perf_counter() - began
+    return function(*arguments, **options), time.perf_counter() - began
 
 
 def measure_cell(cell: Cell, seeds: Sequence[int], out: Path) -> float:
@@ -86,9 +87,7 @@ def _base(config: Config, seeds: Sequence[int]) -> Measured:
 
 
 def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
-    began = time.perf_counter()
-    bundle = methods.centralized(config, progress=False)
-    seconds = time.perf_counter() - began
+    bundle, seconds = _timed(methods.centralized, config, progress=False)
     return replace(_measure(bundle, config, seeds), steps={GLOBAL: methods.counted(config)}, train_s=seconds)
 
 
@@ -116,9 +115,8 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure each client's own model on all held-out episodes; the rollouts are divided among the clients."""
     results, steps, seconds = [], {}, 0.0
     for client in range(config.num_clients):
-        began = time.perf_counter()
-        bundle = methods.local_only(config, client, progress=False)
-        seconds += time.perf_counter() - began
+        bundle, took_s = _timed(methods.local_only, config, client, progress=False)
+        seconds += took_s
         steps[client_name(client)] = methods.counted(config, client)
         result = _measure(bundle, config, seeds[client :: config.num_clients])
         results.append(replace(result, rows=[{**row, "client": client} for row in result.rows]))

@@ -26,6 +26,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,17 @@ from fedvla_lib.config import Config, from_profile
 from fedvla_lib.evaluation.rollouts import rollout_seeds
 
 FILE_NAME = re.compile(r"[\w-]+", re.ASCII)
-NAMES = {"profile", "seeds", "rollouts", "first_rollout_seed", "settings", "partitions", "methods", "only"}
+# What a file may hold: by name, a test of the value, and usable values in words.
+CONTENT = {
+    "seeds": (lambda it: isinstance(it, list) and all(type(seed) is int for seed in it), "a list of whole numbers"),
+    "rollouts": (lambda it: type(it) is int and it > 0, "a number above 0"),
+    "first_rollout_seed": (lambda it: type(it) is int, "a whole number"),
+    "settings": (lambda it: isinstance(it, dict), "a table"),
+    "methods": (lambda it: isinstance(it, dict) and all(isinstance(one, dict) for one in it.values()), "tables"),
+    "partitions": (lambda it: isinstance(it, dict) and all(isinstance(one, dict) for one in it.values()), "tables"),
+    "only": (lambda it: isinstance(it, list) and all(isinstance(rule, dict) for rule in it), "tables [[only]]"),
+    "profile": (lambda it: isinstance(it, str), "a name"),
+}
 KINDS = ("base", "federated", "centralized", "local-only", "clients")
 RULES = ("method", "partition", "seed", "kind")  # what a rule under [[only]] may name
 # A cell has an evaluation of its own; evaluations inside its training would cost time and decide nothing.
@@ -77,8 +88,8 @@ def read_plan(file: Path) -> Plan:
     for name in ("methods", "partitions", "seeds", "rollouts"):
         if not content.get(name):
             raise ValueError(f"{file} lacks {name!r}: give one of each of methods, partitions, seeds and rollouts")
-    if unknown := sorted(set(content) - NAMES):
-        raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(NAMES))}")
+    if unknown := sorted(set(content) - set(CONTENT)):
+        raise ValueError(f"{file}: unknown name {unknown[0]!r}: choose from {', '.join(sorted(CONTENT))}")
     _check_types(content, Path(file))
     cells, only = list(_cells(content, Path(file))), content.get("only", [])
     if only:
@@ -87,36 +98,22 @@ def read_plan(file: Path) -> Plan:
 
 
 def _check_types(content: dict[str, Any], file: Path) -> None:
-    seeds = content["seeds"]
-    checks = {
-        "seeds": (isinstance(seeds, list) and all(type(seed) is int for seed in seeds), "a list of whole numbers"),
-        "rollouts": (type(content["rollouts"]) is int and content["rollouts"] > 0, "a number above 0"),
-        "first_rollout_seed": (type(content.get("first_rollout_seed", 0)) is int, "a whole number"),
-        "settings": (isinstance(content.get("settings", {}), dict), "a table"),
-    }
-    for name in ("methods", "partitions"):
-        tables = content[name]
-        checks[name] = (isinstance(tables, dict) and all(isinstance(t, dict) for t in tables.values()), "tables")
-    only = content.get("only", [])
-    checks["only"] = (isinstance(only, list) and all(isinstance(rule, dict) for rule in only), "tables [[only]]")
-    checks["profile"] = (isinstance(content.get("profile", ""), str), "a name")
-    for name, (fits, wanted) in checks.items():
-        if not fits:
+    for name, (fits, wanted) in CONTENT.items():
+        if name in content and not fits(content[name]):
             raise ValueError(f"{file}: {name}={content[name]!r} is not usable: give {wanted}")
-    for rule in only:
+    for rule in content.get("only", []):
         if unknown := sorted(set(rule) - set(RULES)):
             raise ValueError(f"{file}: unknown name {unknown[0]!r} under [[only]]: choose from {', '.join(RULES)}")
 
 
 def _cells(content: dict[str, Any], file: Path) -> Iterator[Cell]:
-    for seed in content["seeds"]:
-        for partition, of_partition in content["partitions"].items():
-            for method, of_method in content["methods"].items():
-                own = dict(of_method)
-                kind = own.pop("kind", "federated")
-                if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
-                    raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
-                if kind not in KINDS:
-                    raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
-                settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
-                yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))
+    partitions, methods = content["partitions"].items(), content["methods"].items()
+    for seed, (partition, of_partition), (method, of_method) in product(content["seeds"], partitions, methods):
+        own = dict(of_method)
+        kind = own.pop("kind", "federated")
+        if bad := [name for name in (partition, method) if not FILE_NAME.fullmatch(name)]:
+            raise ValueError(f"{file}: {bad[0]!r} becomes part of a file name: use letters, digits, - and _")
+        if kind not in KINDS:
+            raise ValueError(f"{file}: method {method!r} has kind {kind!r}: choose one of {', '.join(KINDS)}")
+        settings = QUIET | content.get("settings", {}) | of_partition | own | {"seed": seed}
+        yield Cell(method, kind, partition, seed, from_profile(content.get("profile"), **settings))

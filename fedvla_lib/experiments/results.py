@@ -24,7 +24,10 @@ def read_results(folder: Path) -> pd.DataFrame:
 
     train_s is NaN if the stamp has no training time. steps_in_all and steps_in_a_row are gradient steps of the model
     that made the rollout. `counted` tells whether they were counted while training; for older cells they are derived
-    from the settings, and a local-only client gets its share of the total. Raises ValueError if there is no result.
+    from the settings, and a local-only client gets its share of the total.
+
+    Raises:
+        ValueError: there is no result.
     """
     return pd.concat([_rollouts(cell) for cell in cell_folders(folder)], ignore_index=True)
 
@@ -58,21 +61,15 @@ def _rollouts(cell: Path) -> pd.DataFrame:
 
 def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
     """Columns counted, steps_in_all and steps_in_a_row of the model that made each rollout."""
-    counted = stamp.get("steps")
-    by_model = counted or {GLOBAL: _planned(stamp, config)}
+    counted, total = stamp.get("steps"), stamp["gradient_steps"]
+    if stamp["kind"] == LOCAL_ONLY:
+        total //= config.num_clients
+    in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in PARALLEL else total
+    by_model = counted or {GLOBAL: {"in_all": total, "in_a_row": in_a_row}}
     clients = rows.client.map("client_{:.0f}".format) if "client" in rows else pd.Series(GLOBAL, rows.index)
     models = [name if name in by_model else GLOBAL for name in clients]
     steps = {f"steps_{how}": [by_model[name][how] for name in models] for how in ("in_all", "in_a_row")}
     return {"counted": counted is not None, **steps}
-
-
-def _planned(stamp: dict[str, Any], config: Config) -> dict[str, int]:
-    """Gradient steps of each model of a cell, derived from the settings."""
-    total = stamp["gradient_steps"]
-    if stamp["kind"] == LOCAL_ONLY:
-        total //= config.num_clients
-    in_a_row = config.num_server_rounds * config.local_steps if stamp["kind"] in PARALLEL else total
-    return {"in_all": total, "in_a_row": in_a_row}
 
 
 def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> pd.DataFrame:

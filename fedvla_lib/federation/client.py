@@ -166,11 +166,3 @@ def open_pooled(config: Config, loaders: Loaders = LOADERS, partition_id: int = 
 def client_seed(seed: int, partition_id: int) -> int:
     """Return the seed of a client's random stream, different for each client and run."""
     return int(np.random.SeedSequence([seed, partition_id]).generate_state(1)[0])
-
-
-def kept_between_rounds(config: Config) -> dict[str, bool]:
-    """Return, by setting, whether it makes clients keep state between rounds."""
-    return {
-        f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
-        f"exchange={config.exchange}": config.exchange != "float32", "personal": bool(config.personal),
-    }  # fmt: skip

@@ -47,7 +47,11 @@ def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
 
 
 def unpack_arrays(record: ArrayRecord) -> Arrays:
-    """Return the arrays of a record by name; raise ParameterError if the bytes of one cannot be decoded."""
+    """Return the arrays of a record by name.
+
+    Raises:
+        ParameterError: the bytes of an array cannot be decoded, or differ from the declaration.
+    """
     arrays = {}
     for name, array in record.items():
         try:
@@ -115,7 +119,8 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     """Return the rollouts of an evaluation reply.
 
     Raises:
-        ParameterError: they cannot be read, or a file name is not a rollout's: clients must not choose where we write.
+        ParameterError: they cannot be read, or a file name is not a rollout's, so that a client cannot choose where the
+            server writes.
     """
     note = content.config_records.get(NOTE, {})
     try:

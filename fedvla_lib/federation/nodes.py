@@ -28,20 +28,17 @@ class TooFewReplies(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Introduction:
-    """What a client reports before training."""
-
-    partition_id: int
-    num_examples: int  # training frames
-    stats: Stats
-
-
-@dataclass(frozen=True)
 class Roster:
-    """Which node holds which partition."""
+    """Which node holds which partition, and what its client reported before training; all by node id."""
 
-    partition_of: dict[int, int]  # node id -> partition id
-    examples_of: dict[int, int] = field(default_factory=dict)  # node id -> training frames that it reported
+    partition_of: dict[int, int]
+    examples_of: dict[int, int] = field(default_factory=dict)  # training frames
+    stats_of: dict[int, Stats] = field(default_factory=dict)
+
+    @property
+    def nodes(self) -> list[int]:
+        """Node ids, ordered by partition."""
+        return sorted(self.partition_of, key=self.partition_of.get)
 
     def name(self, node_id: int) -> str:
         """Return the client's name: ``client_3`` holds partition 3."""
@@ -49,9 +46,25 @@ class Roster:
 
     def sample(self, share: float, rng: np.random.Generator) -> list[int]:
         """Sample a share of the clients without replacement: `sample_size` node ids, ordered by partition."""
-        nodes = sorted(self.partition_of, key=self.partition_of.get)
+        nodes = self.nodes
         size = sample_size(share, len(nodes))
         return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
+
+    def add(self, reply: Message) -> None:
+        """Add the client that introduces itself in `reply`; raise ParameterError if it cannot take part."""
+        node, note = reply.metadata.src_node_id, answered(reply).content.config_records.get(NOTE, {})
+        partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
+        taken = self.partition_of.values()
+        if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
+            raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
+        if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
+            text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
+            raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
+        try:
+            self.stats_of[node] = _statistics(note.get("stats"), num_examples)
+        except ParameterError as error:
+            raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
+        self.partition_of[node], self.examples_of[node] = partition_id, num_examples
 
 
 def sample_size(share: float, num_clients: int) -> int:
@@ -77,25 +90,17 @@ def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
     return nodes
 
 
-def introduce_nodes(
-    grid: Grid, nodes: list[int], report: Report, timeout_s: float
-) -> tuple[Roster, list[Introduction]]:
-    """Ask every node for its partition, frame count and statistics; report and skip nodes whose reply is invalid.
-
-    Returns the roster, and the introductions ordered by partition.
-    """
+def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> Roster:
+    """Ask every node for its partition, frame count and statistics; report and skip nodes whose reply is invalid."""
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
-    replies = sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id)
-    found: dict[int, Introduction] = {}
-    for reply in replies:
-        node = reply.metadata.src_node_id
+    roster = Roster({})
+    for reply in sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id):
         try:
-            found[node] = _introduction(reply, {other.partition_id for other in found.values()})
+            roster.add(reply)
         except ParameterError as error:
-            report(0, f"node_{node}", "rejected", {"to": "query", "reason": error.kind, "detail": str(error)})
-    ordered = sorted(found, key=lambda node: found[node].partition_id)
-    roster = Roster({n: found[n].partition_id for n in ordered}, {n: found[n].num_examples for n in ordered})
-    return roster, [found[node] for node in ordered]
+            values = {"to": "query", "reason": error.kind, "detail": str(error)}
+            report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
+    return roster
 
 
 def answered(reply: Message | None) -> Message:
@@ -105,20 +110,6 @@ def answered(reply: Message | None) -> Message:
     if reply.has_error():
         raise ParameterError("error", " ".join(str(reply.error.reason).split()) or f"error code {reply.error.code}")
     return reply
-
-
-def _introduction(reply: Message, taken: set[int]) -> Introduction:
-    note = answered(reply).content.config_records.get(NOTE, {})
-    partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
-    if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
-        raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
-    if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
-        text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
-        raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
-    try:
-        return Introduction(partition_id, num_examples, _statistics(note.get("stats"), num_examples))
-    except ParameterError as error:
-        raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
 
 
 def _statistics(text: Any, num_examples: int) -> Stats:

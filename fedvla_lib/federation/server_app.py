@@ -6,7 +6,7 @@ It leaves the path of the run folder in ``context.state["run"]["folder"]``.
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
 from flwr.serverapp import Grid, ServerApp
@@ -18,8 +18,8 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds
 from fedvla_lib.federation import checkpoint, messages
 from fedvla_lib.federation.checkpoint import Checkpoint
-from fedvla_lib.federation.client import LOADERS, Loaders, kept_between_rounds
-from fedvla_lib.federation.nodes import Roster, TooFewReplies, client_name, introduce_nodes, wait_for_nodes
+from fedvla_lib.federation.client import LOADERS, Loaders
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
 from fedvla_lib.federation.throttled_grid import for_runtime
@@ -31,8 +31,9 @@ from fedvla_lib.run_folder import GLOBAL, RunFolder
 CONNECT_TIMEOUT_S = 60.0  # for all clients to connect
 
 
+@runtime_checkable
 class ClientStates(Protocol):
-    """An engine that can read and restore the states of its clients."""
+    """A grid that can read and restore the states of its clients; else only runs that keep none can be resumed."""
 
     def client_states(self) -> dict[str, Arrays]:
         """Return the clients' arrays by client and kind, then by name."""
@@ -41,20 +42,12 @@ class ClientStates(Protocol):
         """Restore what `client_states` returned."""
 
 
-def build(
-    loaders: Loaders = LOADERS,
-    *,
-    engine: str = "flower",
-    progress: bool = False,
-    states: ClientStates | None = None,
-    jobs: int = 1,
-) -> ServerApp:
+def build(loaders: Loaders = LOADERS, *, engine: str = "flower", progress: bool = False, jobs: int = 1) -> ServerApp:
     """Return the ServerApp.
 
     Args:
         engine: name for the stamp.
         progress: show progress bars for rollouts.
-        states: gives access to client states; without it, only runs whose clients keep no state can be resumed.
         jobs: processes that roll the global model out at a time.
     """
     app = ServerApp()
@@ -64,15 +57,12 @@ def build(
         config = from_run_config(context.run_config)
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(for_runtime(grid), config, run, loaders, progress, states, jobs)
+            federate(for_runtime(grid), config, run, loaders, progress, jobs)
 
     return app
 
 
-def federate(
-    grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, states: ClientStates | None = None,
-    jobs: int = 1,
-) -> None:  # fmt: skip
+def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, jobs: int = 1) -> None:
     """Run or resume a federation on `grid` and write it to `run`.
 
     Raises:
@@ -80,9 +70,13 @@ def federate(
         ValueError: unusable settings or data.
     """
     check_tasks(task_names(config))
+    states = grid if isinstance(grid, ClientStates) else None
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
-    roster, weights, pooled = _introduce(grid, config, run)
+    roster = _introduce(grid, config, run)
+    total = sum(roster.examples_of.values())
+    weights = {node: examples / total for node, examples in roster.examples_of.items()}
+    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
@@ -94,7 +88,6 @@ def federate(
     )  # fmt: skip
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
-    evaluator = GlobalEvaluator(config, store, bundle, run, progress, jobs)
     packed = normalisation.pack_stats(stats)
     strategy.start(
         grid,
@@ -103,35 +96,66 @@ def federate(
         timeout=config.round_timeout_s,
         train_config=ConfigRecord({messages.STATS: packed}),
         evaluate_config=ConfigRecord({messages.STATS: packed}),
-        evaluate_fn=RoundEnd(evaluator, strategy, states),
+        evaluate_fn=RoundEnd(config, store, bundle, run, strategy, states, progress, jobs),
     )
 
 
 @dataclass(frozen=True)
 class RoundEnd:
-    """Evaluates the global model of a round and writes a checkpoint. Flower calls it first for round 0."""
+    """Saves and measures the global model of a round, and writes a checkpoint. Flower calls it first for round 0.
 
-    evaluator: "GlobalEvaluator"
+    Personal parts of the global model are as they were before training.
+    """
+
+    config: Config
+    store: frame_store.FrameStore
+    bundle: model.Bundle
+    run: RunFolder
     strategy: Checked
     states: ClientStates | None
+    progress: bool
+    jobs: int
 
     def __call__(self, flower_round: int, record: ArrayRecord) -> MetricRecord | None:
         """End a round, unless an earlier process already did."""
         if self.strategy.rounds_done and flower_round == 0:
             return None
-        number = self.strategy.rounds_done + flower_round
-        measured = self.evaluator(number, record)
+        number, arrays = self.strategy.rounds_done + flower_round, messages.unpack_arrays(record)
+        measured = self._evaluate(number, arrays) if measure.is_validated(self.config, number) else {}
         strategy = checkpoint.flat(self.strategy.state())
         clients = checkpoint.flat(self.states.client_states() if self.states else {})
-        checkpoint.save(self.evaluator.run.root, Checkpoint(number, messages.unpack_arrays(record), strategy, clients))
-        return measured
+        checkpoint.save(self.run.root, Checkpoint(number, arrays, strategy, clients))
+        return MetricRecord(measured)
+
+    def _evaluate(self, round_number: int, arrays: Arrays) -> dict[str, float]:
+        """Save ``global_model/round_N``, measure and log held-out loss, action error and success in closed loop.
+
+        Round 0 is the model before training.
+        """
+        started = time.perf_counter()
+        load_arrays(self.bundle.policy, arrays | self.bundle.own)
+        model.save_policy(self.bundle, self.run.model_dir(round_number))
+        due = measure.rolls_out(self.config, round_number)
+        found = measure.measure(
+            self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
+            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress, jobs=self.jobs,
+        )  # fmt: skip
+        measure.log_measurement(self.run, round_number, GLOBAL, found)
+        values = found.averages | found.success() | found.success_by_task(task_names(self.config))
+        counted = {"num_examples": found.num_examples, **values, "seconds": time.perf_counter() - started}
+        self.run.log(round_number, GLOBAL, "evaluate", counted)
+        return values
 
 
 def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
     """Return the checkpoint to resume from, and remove what was written of later rounds."""
     if not config.resume:
         return None
-    settings = [setting for setting, kept in kept_between_rounds(config).items() if kept]
+    keeps_state = {
+        f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
+        f"exchange={config.exchange}": config.exchange != "float32", "personal": config.personal,
+    }  # fmt: skip
+    settings = [setting for setting, kept in keeps_state.items() if kept]
     if settings and not states:
         raise ValueError(
             f"{settings[0]} makes clients keep state between rounds, which is lost when a run ends on this "
@@ -144,56 +168,18 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     return found
 
 
-@dataclass(frozen=True)
-class GlobalEvaluator:
-    """Saves and measures the global model of a round: held-out loss, action error, closed-loop success.
-
-    Personal parts of the global model are as they were before training.
-    """
-
-    config: Config
-    store: frame_store.FrameStore
-    bundle: model.Bundle
-    run: RunFolder
-    progress: bool
-    jobs: int
-
-    def __call__(self, round_number: int, arrays: ArrayRecord) -> MetricRecord:
-        """Save ``global_model/round_N``, measure it and log the result; round 0 is the model before training."""
-        if not measure.is_validated(self.config, round_number):
-            return MetricRecord({})
-        started = time.perf_counter()
-        load_arrays(self.bundle.policy, messages.unpack_arrays(arrays) | self.bundle.own)
-        model.save_policy(self.bundle, self.run.model_dir(round_number))
-        due = measure.rolls_out(self.config, round_number)
-        found = measure.measure(
-            self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
-            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress, jobs=self.jobs,
-        )  # fmt: skip
-        measure.log_measurement(self.run, round_number, GLOBAL, found)
-        values = found.averages | found.success() | found.success_by_task(task_names(self.config))
-        counted = {"num_examples": found.num_examples, **values, "seconds": time.perf_counter() - started}
-        self.run.log(round_number, GLOBAL, "evaluate", counted)
-        return MetricRecord(values)
-
-
-def _introduce(grid: Grid, config: Config, run: RunFolder) -> tuple[Roster, dict[int, float], normalisation.Stats]:
-    """Ask clients for partition, frame count and statistics; none of their other data leaves them.
-
-    Returns the roster, each node's share of all frames, and the pooled statistics.
-    """
+def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
+    """Ask clients for partition, frame count and statistics; none of their other data leaves them."""
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    roster, introductions = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
-    if len(introductions) < config.min_replies:
+    roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
+    if len(roster.nodes) < config.min_replies:
         raise TooFewReplies(
-            f"{len(introductions)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
+            f"{len(roster.nodes)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
             "required; the rejected ones are in metrics.jsonl"
         )
-    for one in introductions if not config.resume else []:
-        run.log(0, client_name(one.partition_id), "data", {"num_examples": one.num_examples})
-    total = sum(one.num_examples for one in introductions)
-    weights = {node: one.num_examples / total for node, one in zip(roster.partition_of, introductions, strict=True)}
-    return roster, weights, normalisation.pool_stats([one.stats for one in introductions])
+    for node in roster.nodes if not config.resume else []:
+        run.log(0, roster.name(node), "data", {"num_examples": roster.examples_of[node]})
+    return roster
 
 
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: messages.Rollouts) -> None:

@@ -22,7 +22,7 @@ from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, TransitionKey, create_transition
 from safetensors import safe_open
 
-from fedvla_lib.config import Config, granted_cores, personal_parts
+from fedvla_lib.config import Config, granted_cores, split_names
 from fedvla_lib.data.normalisation import Stats
 from fedvla_lib.files import new_folder
 from fedvla_lib.policy import lean_expert
@@ -85,7 +85,7 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
         chosen = {"freeze_a": config.lora_freeze_a, "adapt_state": config.train_state_proj, "seed": config.seed}
         add_adapters(policy, config.lora_rank, **chosen)
     policy.eval()
-    return Bundle(policy, *_processors(policy, stats, source), _own(policy, personal_parts(config)))
+    return Bundle(policy, *_processors(policy, stats, source), _own(policy, split_names(config.personal)))
 
 
 def use_threads(config: Config, policy: SmolVLAPolicy) -> None:

@@ -23,19 +23,21 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
     """
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
     strategy, options = {
-        # sum_k n_k w_k / sum_k n_k with n_k the training frames of client k (https://arxiv.org/abs/1602.05629)
+        # sum_k n_k w_k / sum_k n_k with n_k the training frames of client k
+        # (McMahan et al. 2017, https://arxiv.org/abs/1602.05629)
         "fedavg": (FedAvg, {}),
-        # the clients add mu / 2 ||w - w_global||^2 to their loss, see `fedprox` (https://arxiv.org/abs/1812.06127)
+        # the clients add mu / 2 ||w - w_global||^2 to their loss, see `fedprox`
+        # (Li et al. 2020, https://arxiv.org/abs/1812.06127)
         "fedprox": (FedProx, {"proximal_mu": config.proximal_mu}),
-        # momentum on the server (https://arxiv.org/abs/1909.06335)
+        # momentum on the server (Hsu et al. 2019, https://arxiv.org/abs/1909.06335)
         "fedavgm": (FedAvgM, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
-        # Adam on the server, the averaged update as its gradient (https://arxiv.org/abs/2003.00295)
+        # Adam on the server, the averaged update as its gradient (Reddi et al. 2021, https://arxiv.org/abs/2003.00295)
         "fedadam": (FedAdam, {"eta": rate, "tau": ADAPTIVITY}),
-        # the same with a second moment that grows more slowly
+        # Yogi: the same with a second moment that grows more slowly (Reddi et al. 2021, same paper)
         "fedyogi": (FedYogi, {"eta": rate, "tau": ADAPTIVITY}),
-        # the median of each coordinate, every client counting alike (https://arxiv.org/abs/1803.01498)
+        # the median of each coordinate, every client counting alike (Yin et al. 2018, https://arxiv.org/abs/1803.01498)
         "fedmedian": (FedMedian, {}),
-        # the one model that lies closest to the others (https://arxiv.org/abs/1703.02757)
+        # the one model that lies closest to the others (Blanchard et al. 2017, https://arxiv.org/abs/1703.02757)
         "krum": (Krum, {"num_malicious_nodes": config.num_malicious}),
         "scaffold": (CheckedScaffold, {"weights": weights}),
     }[config.strategy]
