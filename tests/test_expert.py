@@ -8,7 +8,8 @@ import pytest
 from fedvla_lib.robot.expert import Expert, expert_success
 from fedvla_lib.robot.rollout import run_episode
 from fedvla_lib.robot.scene import GRASP_SITE
-from fedvla_lib.robot.sim import HOME, So100Env
+from fedvla_lib.robot.sim import HOME, So100Env, to_radians
+from fedvla_lib.robot.spec import NUM_JOINTS
 from fedvla_lib.robot.tasks import TASKS
 
 pytestmark = pytest.mark.integration
@@ -61,7 +62,8 @@ def test_inverse_kinematics_reaches_the_waypoints():
     expert.reset(env, seed=0)
     closing = next(i for i, (now, later) in enumerate(pairwise(expert._path)) if later.gripper < now.gripper)
     for target in expert._path[: closing + 1]:  # from there on the jaws push against the cube
-        env._put_arm(expert._arm.solve(target))
+        joints_rad = to_radians(expert._arm.solve(target), env.model.jnt_range[:NUM_JOINTS])
+        env.data.qpos[:NUM_JOINTS] = env.data.ctrl[:] = joints_rad
         env._advance()
         np.testing.assert_allclose(env.data.site(GRASP_SITE).xpos, target.position_m, atol=2e-3)
 

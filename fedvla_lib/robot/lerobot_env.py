@@ -6,7 +6,7 @@ LeRobot imports the module named by its plugin flag before it parses the rest of
         --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -31,8 +31,6 @@ class So100SimConfig(EnvConfig):
     fps: int = FPS
     image_size: int = 96  # side of the square camera images in pixels
     render_mode: str = "rgb_array"
-    features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_tasks(self.task_names)

@@ -86,7 +86,9 @@ class So100Env(gymnasium.Env):
         self._renderer: SceneRenderer | None = None
         # Never self: a reference cycle would be freed late, in any thread.
         self._renderer_of = renderer_of and (renderer_of._renderer_of or renderer_of)
-        self.action_space = spaces.Box(*self._range(), dtype=np.float32)
+        self._limits_rad = self.model.jnt_range[:NUM_JOINTS]
+        low, high = (from_radians(ends_rad, self._limits_rad) for ends_rad in self._limits_rad.T)
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = self._observation_space()
         self._touches = _touches(self.model)
         self.layout = draw_layout(self._task, np.random.default_rng(0))
@@ -97,20 +99,17 @@ class So100Env(gymnasium.Env):
         """The instruction of this episode."""
         return self.layout.instruction
 
+    task_description = instruction  # the name used by LeRobot's evaluation
+
     @property
     def zones(self) -> tuple[Patch, ...]:
         """The task's zones, in the order of the layout."""
         return self._task.zones
 
     @property
-    def task_description(self) -> str:
-        """The instruction, under the name used by LeRobot's evaluation."""
-        return self.instruction
-
-    @property
     def joints(self) -> np.ndarray:
         """Reported joint positions, with calibration error, float32 (6,), LeRobot units."""
-        return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS]) + self.joint_offset
+        return from_radians(self.data.qpos[:NUM_JOINTS], self._limits_rad) + self.joint_offset
 
     @property
     def joint_offset(self) -> np.ndarray:
@@ -140,14 +139,15 @@ class So100Env(gymnasium.Env):
         mujoco.mj_resetData(self.model, self.data)
         scene.apply_lab(self.model, self.lab)
         home = HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)
-        self._put_arm(_check_joints(options.get("joints", home), "joints"))
+        start = _check_joints(options.get("joints", home), "joints")
+        self.data.qpos[:NUM_JOINTS] = self.data.ctrl[:] = to_radians(start, self._limits_rad)
         scene.place_objects(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
-        cubes = scene.cubes_of(self.model)[: len(self.layout.cubes)]
+        cubes = scene.CUBES[: len(self.layout.cubes)]
         self._histories = [_CubeHistory(tuple(self.data.body(name).xpos.tolist())) for name in cubes]
         self._needs_reset = False
-        return self._observation(), self._info()
+        return self._observation(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
         """Move towards the joint targets `action` for one control step.
@@ -160,7 +160,7 @@ class So100Env(gymnasium.Env):
         if self._needs_reset:
             raise RuntimeError("the episode is over: call reset() before step()")
         low, high = self.action_space.low, self.action_space.high
-        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
+        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self._limits_rad)
         touched = self._advance()
         task = self._task
         now = self._touching()
@@ -170,11 +170,14 @@ class So100Env(gymnasium.Env):
         terminated = self._streak >= task.hold_steps
         truncated = not terminated and self._step_count >= self._max_episode_steps
         self._needs_reset = terminated or truncated
-        return self._observation(), float(terminated), terminated, truncated, self._info()
+        return self._observation(), float(terminated), terminated, truncated, {"is_success": terminated}
 
     def camera_images(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
         """Render the current scene: camera -> uint8 (size, size, 3)."""
-        return {camera: self._draw(camera) for camera in cameras}
+        owner = self._renderer_of or self
+        if owner._renderer is None:
+            owner._renderer = open_renderer(owner.model, owner.image_size)
+        return {camera: owner._renderer.draw(self.model, self.data, camera) for camera in cameras}
 
     def render(self) -> np.ndarray | None:
         """Return all cameras side by side, uint8 (size, 2 * size, 3); None without a render mode."""
@@ -187,11 +190,6 @@ class So100Env(gymnasium.Env):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-    def _put_arm(self, joints: np.ndarray) -> None:
-        radians = to_radians(joints, self.model.jnt_range[:NUM_JOINTS])
-        self.data.qpos[:NUM_JOINTS] = radians
-        self.data.ctrl[:] = radians
 
     def _advance(self) -> set[tuple[str, str]]:
         """Simulate one control step; return what touched during it, see `_touching`."""
@@ -240,21 +238,8 @@ class So100Env(gymnasium.Env):
             observation["pixels"] = self.camera_images(self.cameras)
         return observation
 
-    def _info(self) -> dict[str, Any]:
-        return {"is_success": self._streak >= self._task.hold_steps}
-
-    def _draw(self, camera: str) -> np.ndarray:
-        owner = self._renderer_of or self
-        if owner._renderer is None:
-            owner._renderer = open_renderer(owner.model, owner.image_size)
-        return owner._renderer.draw(self.model, self.data, camera)
-
-    def _range(self) -> tuple[np.ndarray, np.ndarray]:
-        limits_rad = self.model.jnt_range[:NUM_JOINTS]
-        return from_radians(limits_rad[:, 0], limits_rad), from_radians(limits_rad[:, 1], limits_rad)
-
     def _observation_space(self) -> spaces.Dict:
-        low, high = self._range()
+        low, high = self.action_space.low, self.action_space.high
         margin = 10.0  # MuJoCo's joint limits are soft
         parts: dict[str, spaces.Space] = {"agent_pos": spaces.Box(low - margin, high + margin, dtype=np.float32)}
         if self.cameras:
