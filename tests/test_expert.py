@@ -76,7 +76,7 @@ def test_a_cube_held_over_the_square_is_not_placed():
     observation, _ = env.reset(seed=0)
     expert.reset(env, seed=0)
     action = HOME
-    while np.linalg.norm(env.cube_m - (*env.layout.zone_xy_m, 0.014)) > 0.012:
+    while np.linalg.norm(env.cube_m - (*env.layout.zones_xy_m[0], 0.014)) > 0.012:
         action = expert.act(observation)
         observation, _, terminated, *_ = env.step(action)
         assert not terminated
@@ -98,7 +98,7 @@ def end_after_doing(asked: str, done: str) -> float:
     while not truncated:
         *_, terminated, truncated, _ = env.step(expert.act({}))
         assert not terminated
-    return float(np.linalg.norm(env.cube_m[:2] - env.layout.zone_xy_m))
+    return float(np.linalg.norm(env.cube_m[:2] - env.layout.zones_xy_m[0]))
 
 
 def test_a_cube_carried_into_the_circle_is_not_pushed():

@@ -18,11 +18,6 @@ VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly t
 VALIDATION_BATCH = 32  # fixed, so that the noise does not depend on the batch size of training
 
 
-def validate(bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0) -> dict[str, float]:
-    """Return the averages of `measure_frames` over all frames of the batches."""
-    return average(measure_frames(bundle, batches, tolerance=tolerance, seed=seed))
-
-
 def measure_frames(
     bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0
 ) -> dict[str, np.ndarray]:
@@ -79,20 +74,8 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.double().cpu().numpy()
 
 
-def held_out_frames(
-    bundle: Bundle, store: FrameStore, episode_ids: Sequence[int], config: Config
-) -> dict[str, np.ndarray]:
-    """Return `measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
-    batches = held_out_batches(store, episode_ids, config)
-    if not batches:
-        return {}
-    return measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
-
-
-def by_episode(
-    frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]
-) -> list[dict[str, float]]:
-    """Return the averages of `held_out_frames` for each episode, with episode_id and num_examples."""
+def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]) -> list[dict[str, float]]:
+    """Return the averages of measured `held_out_batches` for each episode, with episode_id and num_examples."""
     counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
     ends = np.cumsum(counts)
     return [

@@ -204,7 +204,8 @@ def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
 
 
 def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
+    zone_xy_m = layout.zones_xy_m[0]
+    return [_move(start, (*zone_xy_m, POINT_HEIGHT_M), _polar(*zone_xy_m)[1], OPEN)]
 
 
 def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
@@ -229,8 +230,8 @@ def _polar(x: float, y: float) -> tuple[float, float]:
 
 PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
     "lift": lambda layout, start: _grasp_and_move(start, layout.cubes[0], (*layout.cubes[0].xy_m, LIFT_HEIGHT_M)),
-    "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M),
-    "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m)),
+    "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zones_xy_m[0], GRASP_HEIGHT_M),
+    "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zones_xy_m[0])),
     "stack": lambda layout, start: _carry(start, layout.cubes[0], layout.cubes[1].xy_m, STACK_HEIGHT_M),
     "sort": _sort_plan,
     "reach": lambda layout, start: [

@@ -113,8 +113,8 @@ class RunningEpisode:
     def result(self) -> Episode:
         sim = self.env.unwrapped
         return Episode(
-            task=sim.task, instruction=sim.instruction, color=sim.layout.color, seed=self.seed, success=self._success,
+            task=sim.task, instruction=sim.instruction, color=sim.layout.cubes[0].color, seed=self.seed,
             states=np.stack([frame["agent_pos"] for frame in self._observations]).reshape(-1, NUM_JOINTS),
-            actions=np.stack(self._actions),
+            actions=np.stack(self._actions), success=self._success,
             images={name: np.stack([frame["pixels"][name] for frame in self._observations]) for name in sim.cameras},
         )  # fmt: skip

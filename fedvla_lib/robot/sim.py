@@ -13,7 +13,7 @@ turns to the arm's left, positive shoulder_lift leans forward, positive elbow_fl
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -145,7 +145,7 @@ class So100Env(gymnasium.Env):
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
         cubes = scene.CUBES[: len(self.layout.cubes)]
-        self._histories = [_CubeHistory(tuple(self.data.body(name).xpos.tolist())) for name in cubes]
+        self._states = [TaskState(start_m=tuple(self.data.body(name).xpos.tolist())) for name in cubes]
         self._needs_reset = False
         return self._observation(), {"is_success": False}
 
@@ -164,7 +164,8 @@ class So100Env(gymnasium.Env):
         touched = self._advance()
         task = self._task
         now = self._touching()
-        first, *others = (self._measure(index, touched, now) for index in range(len(self._histories)))
+        self._states = [self._measure(index, before, touched, now) for index, before in enumerate(self._states)]
+        first, *others = self._states
         self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
         terminated = self._streak >= task.hold_steps
@@ -205,24 +206,25 @@ class So100Env(gymnasium.Env):
         touches = self._touches  # a dict of Python numbers: this runs 20 times a control step, on a few contacts
         return {touches[pair] for pair in map(tuple, self.data.contact.geom.tolist()) if pair in touches}
 
-    def _measure(self, index: int, touched: set[tuple[str, str]], now: set[tuple[str, str]]) -> TaskState:
-        """Update the history of one cube and return the input of the success predicates.
+    def _measure(
+        self, index: int, before: TaskState, touched: set[tuple[str, str]], now: set[tuple[str, str]]
+    ) -> TaskState:
+        """Return the input of the success predicates for one cube, whose state a control step earlier was `before`.
 
         `touched`: contacts during the control step, `now`: at its end, both as `_touching` returns them.
         """
-        name, history = scene.CUBES[index], self._histories[index]
+        name = scene.CUBES[index]
         parts, cube_m = {part for cube, part in now if cube == name}, tuple(self.data.body(name).xpos.tolist())
         hand_m = tuple(self.data.site(scene.GRASP_SITE).xpos.tolist())
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
-        history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
-        history.carried |= held and clearance_m > CARRY_CLEARANCE_M
-        history.flung |= speed_mps > FLUNG_SPEED_MPS and all(name != cube for cube, _ in touched)
+        flung = speed_mps > FLUNG_SPEED_MPS and all(name != cube for cube, _ in touched)
         return TaskState(
-            clearance_m=clearance_m, peak_clearance_m=history.peak_clearance_m, speed_mps=speed_mps,
-            zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts), carried=history.carried,
-            flung=history.flung, hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))), cube_m=cube_m,
-            start_m=history.start_m, hand_m=hand_m, hand_zone_offset_m=self._from_zone(index, hand_m),
+            clearance_m=clearance_m, peak_clearance_m=max(before.peak_clearance_m, clearance_m), speed_mps=speed_mps,
+            zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts),
+            carried=before.carried or (held and clearance_m > CARRY_CLEARANCE_M), flung=before.flung or flung,
+            hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))), cube_m=cube_m, start_m=before.start_m,
+            hand_m=hand_m, hand_zone_offset_m=self._from_zone(index, hand_m),
         )  # fmt: skip
 
     def _from_zone(self, index: int, point_m: tuple[float, float, float]) -> tuple[float, float]:
@@ -246,16 +248,6 @@ class So100Env(gymnasium.Env):
             image = spaces.Box(0, 255, (self.image_size, self.image_size, 3), np.uint8)
             parts["pixels"] = spaces.Dict({camera: image for camera in self.cameras})
         return spaces.Dict(parts)
-
-
-@dataclass
-class _CubeHistory:
-    """What has happened to a cube so far in this episode."""
-
-    start_m: tuple[float, float, float]
-    peak_clearance_m: float = 0.0
-    carried: bool = False
-    flung: bool = False
 
 
 def to_radians(joints: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:

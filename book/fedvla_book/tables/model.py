@@ -31,6 +31,13 @@ def module_table(policy: "SmolVLAPolicy") -> list[dict[str, Any]]:
     return rows
 
 
+def adapters(policy: "SmolVLAPolicy") -> dict[str, np.ndarray]:
+    """Return all A and B matrices of a policy by name, float32, including frozen ones."""
+    from fedvla_lib.policy.lora import A, B  # loads torch
+
+    return {name: p.detach().cpu().numpy().copy() for name, p in policy.named_parameters() if name.endswith((A, B))}
+
+
 def averaging_error(updates: Sequence[Mapping[str, np.ndarray]], weights: Sequence[float]) -> dict[str, float]:
     """Return, for each adapted matrix, the relative error of averaging A and B separately.
 
