@@ -9,7 +9,6 @@ import torch
 from fedvla_lib.config import Config
 from fedvla_lib.data.batches import batch_of_rows
 from fedvla_lib.data.frame_store import FrameStore
-from fedvla_lib.data.splits import frame_spans
 from fedvla_lib.policy.actor import predict_chunk
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES
@@ -76,7 +75,7 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
 
 def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]) -> list[dict[str, float]]:
     """Return the averages of measured `held_out_batches` for each episode, with episode_id and num_examples."""
-    counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
+    counts = [len(rows) for rows in _measured_rows(store, episode_ids)]
     ends = np.cumsum(counts)
     return [
         {"episode_id": episode, "num_examples": n, **average({k: each[end - n : end] for k, each in frames.items()})}
@@ -86,6 +85,12 @@ def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Se
 
 def held_out_batches(store: FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:
     """Return raw batches of every fifth frame of the given episodes, without augmentation."""
-    rows = [row for start, end in frame_spans(store, episode_ids) for row in range(start, end, VALIDATION_STRIDE)]
+    rows = [row for episode in _measured_rows(store, episode_ids) for row in episode]
     cuts = range(0, len(rows), VALIDATION_BATCH)
     return [batch_of_rows(store, rows[i : i + VALIDATION_BATCH], config.chunk_size) for i in cuts]
+
+
+def _measured_rows(store: FrameStore, episode_ids: Sequence[int]) -> list[range]:
+    """Return every fifth row of each episode."""
+    table = store.episodes.set_index("episode_id").loc[list(episode_ids)]
+    return [range(start, end, VALIDATION_STRIDE) for start, end in zip(table.start, table.end, strict=True)]

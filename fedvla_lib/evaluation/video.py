@@ -27,7 +27,7 @@ def save_rollout(episode: Episode, folder: Path) -> Path:
     return path
 
 
-def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
+def encode_video(frames: np.ndarray) -> bytes:
     """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first.
 
     Raises:
@@ -42,7 +42,7 @@ def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
         path = Path(scratch) / "video.mp4"
         with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
             quality = {"crf": "20", "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
-            stream = container.add_stream("libx264", rate=fps, options=quality)
+            stream = container.add_stream("libx264", rate=FPS, options=quality)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             for pixels in frames:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))

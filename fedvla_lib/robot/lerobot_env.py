@@ -33,18 +33,13 @@ class So100SimConfig(EnvConfig):
     render_mode: str = "rgb_array"
 
     def __post_init__(self) -> None:
-        check_tasks(self.task_names)
+        check_tasks(split_names(self.task))
         action = PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))
         state = PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,))
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         self.features = {ACTION: action, "agent_pos": state, **{f"pixels/{camera}": image for camera in CAMERAS}}
         images = {f"pixels/{camera}": image_key(camera) for camera in CAMERAS}
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, **images}
-
-    @property
-    def task_names(self) -> list[str]:
-        """The tasks to evaluate."""
-        return split_names(self.task)
 
     @property
     def gym_id(self) -> str:
@@ -62,5 +57,5 @@ class So100SimConfig(EnvConfig):
         """Return ``{task: {0: vector environment}}``, one entry per task."""
         return {
             name: EnvConfig.create_envs(replace(self, task=name), n_envs, use_async_envs)[self.type]
-            for name in self.task_names
+            for name in split_names(self.task)
         }

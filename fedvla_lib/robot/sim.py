@@ -24,7 +24,7 @@ from gymnasium import spaces
 from fedvla_lib.robot import scene
 from fedvla_lib.robot.labs import REFERENCE, Lab, draw_lab
 from fedvla_lib.robot.layout import CUBE_HALF_M, Patch
-from fedvla_lib.robot.rendering import SceneRenderer, open_renderer
+from fedvla_lib.robot.rendering import SceneRenderer
 from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.robot.tasks import ALL_TASKS, CARRY_CLEARANCE_M, Task, TaskState, check_tasks, draw_layout
 
@@ -116,11 +116,6 @@ class So100Env(gymnasium.Env):
         """Calibration error: reported minus true joint positions, float32 (6,), LeRobot units."""
         return np.append(self.lab.joint_offset_deg, 0.0).astype(np.float32)
 
-    @property
-    def cube_m(self) -> np.ndarray:
-        """Centre of the first cube in the world frame, float64 (3,)."""
-        return self.data.body(scene.CUBES[0]).xpos.copy()
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Start an episode.
 
@@ -177,7 +172,7 @@ class So100Env(gymnasium.Env):
         """Render the current scene: camera -> uint8 (size, size, 3)."""
         owner = self._renderer_of or self
         if owner._renderer is None:
-            owner._renderer = open_renderer(owner.model, owner.image_size)
+            owner._renderer = SceneRenderer(owner.model, owner.image_size)
         return {camera: owner._renderer.draw(self.model, self.data, camera) for camera in cameras}
 
     def render(self) -> np.ndarray | None:

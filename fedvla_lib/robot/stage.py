@@ -28,7 +28,4 @@ class Stage:
         self._envs.clear()
 
 
-@cache
-def stage_of_process(image_size: int, jitter: float = 0.0) -> Stage:
-    """Return the one stage of this process; a worker leaves it open, since it ends with all that it opened."""
-    return Stage(image_size, jitter)
+stage_of_process = cache(Stage)  # the one of this process; a worker leaves it open, since it ends with all it opened
