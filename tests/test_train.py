@@ -131,13 +131,13 @@ def test_validation_is_deterministic_and_ignores_padded_actions():
 def test_schedule_continues_where_the_last_round_stopped():
     bundle = model.load_policy(CONFIG, STATS)
     config = replace(CONFIG, lr=1e-2, warmup_steps=4)
-    whole, whole_schedule = training._optimizer(bundle, config, 0, 20)
+    whole, whole_schedule = training.adamw(bundle, config, 0, 20)
     rates = []
     for _ in range(20):
         rates.append(whole.param_groups[0]["lr"])
         whole.step()
         whole_schedule.step()
-    later, later_schedule = training._optimizer(bundle, config, 7, 20)
+    later, later_schedule = training.adamw(bundle, config, 7, 20)
     for expected in rates[7:]:
         assert later.param_groups[0]["lr"] == pytest.approx(expected)
         later.step()

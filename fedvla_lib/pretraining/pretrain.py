@@ -54,7 +54,6 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         ValueError: a number in the recipe is not usable.
     """
     _check(recipe)
-    out = Path(out)
     if out.exists():
         raise FileExistsError(f"{out} exists already: give a folder that does not")
     out.absolute().parent.mkdir(parents=True, exist_ok=True)

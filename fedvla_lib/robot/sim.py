@@ -23,7 +23,7 @@ from gymnasium import spaces
 
 from fedvla_lib.robot import scene
 from fedvla_lib.robot.labs import REFERENCE, Lab, draw_lab
-from fedvla_lib.robot.layout import CUBE_HALF_M, Patch
+from fedvla_lib.robot.layout import CUBE_HALF_M
 from fedvla_lib.robot.rendering import SceneRenderer
 from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.robot.tasks import ALL_TASKS, CARRY_CLEARANCE_M, Task, TaskState, check_tasks, draw_layout
@@ -100,11 +100,6 @@ class So100Env(gymnasium.Env):
         return self.layout.instruction
 
     task_description = instruction  # the name used by LeRobot's evaluation
-
-    @property
-    def zones(self) -> tuple[Patch, ...]:
-        """The task's zones, in the order of the layout."""
-        return self._task.zones
 
     @property
     def joints(self) -> np.ndarray:
