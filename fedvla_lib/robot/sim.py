@@ -86,7 +86,7 @@ class So100Env(gymnasium.Env):
         self._renderer: SceneRenderer | None = None
         # Never self: a reference cycle would be freed late, in any thread.
         self._renderer_of = renderer_of and (renderer_of._renderer_of or renderer_of)
-        self._limits_rad = self.model.jnt_range[:NUM_JOINTS]
+        self._limits_rad = self.model.jnt_range[:NUM_JOINTS]  # (6, 2)
         low, high = (from_radians(ends_rad, self._limits_rad) for ends_rad in self._limits_rad.T)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = self._observation_space()
@@ -152,13 +152,12 @@ class So100Env(gymnasium.Env):
         low, high = self.action_space.low, self.action_space.high
         self.data.ctrl[:] = to_radians(np.clip(target, low, high), self._limits_rad)
         touched = self._advance()
-        task = self._task
         now = self._touching()
         self._states = [self._measure(index, before, touched, now) for index, before in enumerate(self._states)]
         first, *others = self._states
-        self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
+        self._streak = self._streak + 1 if self._task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
-        terminated = self._streak >= task.hold_steps
+        terminated = self._streak >= self._task.hold_steps
         truncated = not terminated and self._step_count >= self._max_episode_steps
         self._needs_reset = terminated or truncated
         return self._observation(), float(terminated), terminated, truncated, {"is_success": terminated}
