@@ -142,7 +142,7 @@ def test_an_epoch_visits_every_frame_once_in_an_order_of_its_own(store):
     batches = Batches(store, [0, 3], CHUNK, batch_size=7, seed=0)
     count = batches.num_examples
     assert count == store.episodes["num_frames"].iloc[[0, 3]].sum()
-    visited = batches._order(np.arange(3 * count)).reshape(3, count)
+    visited = replace(batches, batch_size=3 * count).rows_at(0).reshape(3, count)
     for epoch in visited:
         np.testing.assert_array_equal(np.sort(epoch), frame_rows(store, [0, 3]))
     assert not np.array_equal(visited[0], visited[1])

@@ -18,7 +18,7 @@ from safetensors.numpy import load_file
 from fedvla_lib import run_folder
 from fedvla_lib.config import EXCHANGES, STRATEGIES, from_profile, to_run_config
 from fedvla_lib.data import lerobot_reader, normalisation, recordings, splits
-from fedvla_lib.data.batches import Batches
+from fedvla_lib.data.batches import Batches, frame_rows
 from fedvla_lib.engines import inline
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.video import read_video
@@ -175,7 +175,7 @@ def test_clients_weigh_by_their_training_frames_and_normalise_with_pooled_statis
     config = run_folder.read_config(full_run)
     store = recordings.open_frames(config)
     shares = splits.shares(store, config)
-    frames = {f"client_{k}": splits.num_frames(store, share.train_ids) for k, share in enumerate(shares)}
+    frames = {f"client_{k}": len(frame_rows(store, share.train_ids)) for k, share in enumerate(shares)}
     trained = run_folder.read_metrics(full_run, "train")
     assert all(frames[who] == weight for who, weight in zip(trained.who, trained.num_examples, strict=True))
     assert len(set(frames.values())) > 1

@@ -46,9 +46,9 @@ def test_at_first_adapters_change_nothing_and_they_alone_train(setup):
 
 def test_every_client_starts_with_the_same_adapters(setup):
     config, _, _ = setup
-    one, other = (lora.adapters(model.load_policy(config).policy) for _ in range(2))
+    one, other = (tables.adapters(model.load_policy(config).policy) for _ in range(2))
     assert all(np.array_equal(one[name], other[name]) for name in one)
-    seeded = lora.adapters(model.load_policy(replace(config, seed=1)).policy)
+    seeded = tables.adapters(model.load_policy(replace(config, seed=1)).policy)
     assert any(not np.array_equal(one[name], seeded[name]) for name in one)
 
 

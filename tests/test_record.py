@@ -37,7 +37,6 @@ def made_up_episode(index: int, length: int = 5) -> Episode:
     return Episode(
         task="lift",
         instruction=f"Lift the {('red', 'green')[index % 2]} cube.",
-        color="red",
         seed=index,
         states=rng.normal(size=(length, 6)).astype(np.float32),
         actions=rng.normal(size=(length, 6)).astype(np.float32),

@@ -69,7 +69,7 @@ def test_episode_types_and_words(env):
         CAMERAS, (frames, SIZE, SIZE, 3)
     )
     assert episode.task == "lift"
-    assert episode.instruction == f"Lift the {episode.color} cube."
+    assert episode.instruction == f"Lift the {env.layout.cubes[0].color} cube."
 
 
 def test_same_seed_same_episode_with_or_without_images(env):

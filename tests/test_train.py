@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fedvla_lib.config import from_profile
-from fedvla_lib.evaluation.held_out import validate
+from fedvla_lib.evaluation.held_out import average, measure_frames
 from fedvla_lib.federation import messages
 from fedvla_lib.policy import model, training
 from fedvla_lib.policy.parameters import load_arrays, trainable, trainable_arrays
@@ -109,9 +109,9 @@ def test_training_lowers_the_held_out_loss():
     config = replace(CONFIG, lr=3e-3, warmup_steps=2)
     bundle = model.load_policy(config, STATS)
     held_out = [SyntheticBatches().at(10_000 + i) for i in range(4)]
-    before = validate(bundle, held_out, tolerance=5.0)
+    before = average(measure_frames(bundle, held_out, tolerance=5.0))
     training.local_train(bundle, SyntheticBatches(), config, steps=40, progress=False)
-    after = validate(bundle, held_out, tolerance=5.0)
+    after = average(measure_frames(bundle, held_out, tolerance=5.0))
     assert after["loss"] < 0.8 * before["loss"]
     assert after["action_error"] < before["action_error"]
 
@@ -120,24 +120,24 @@ def test_training_lowers_the_held_out_loss():
 def test_validation_is_deterministic_and_ignores_padded_actions():
     bundle = model.load_policy(CONFIG, STATS)
     held_out = [SyntheticBatches().at(0)]
-    first = validate(bundle, held_out, tolerance=5.0)
+    first = average(measure_frames(bundle, held_out, tolerance=5.0))
     held_out[0][ACTION_KEY][0, -3:] = 1e6
-    assert validate(bundle, held_out, tolerance=5.0) == first
+    assert average(measure_frames(bundle, held_out, tolerance=5.0)) == first
     with pytest.raises(ValueError, match="held-out"):
-        validate(bundle, [], tolerance=5.0)
+        measure_frames(bundle, [], tolerance=5.0)
 
 
 @pytest.mark.unit
 def test_schedule_continues_where_the_last_round_stopped():
     bundle = model.load_policy(CONFIG, STATS)
     config = replace(CONFIG, lr=1e-2, warmup_steps=4)
-    whole, whole_schedule = training._optimizer(bundle, config, 0, 20)
+    whole, whole_schedule = training.adamw(bundle, config, 0, 20)
     rates = []
     for _ in range(20):
         rates.append(whole.param_groups[0]["lr"])
         whole.step()
         whole_schedule.step()
-    later, later_schedule = training._optimizer(bundle, config, 7, 20)
+    later, later_schedule = training.adamw(bundle, config, 7, 20)
     for expected in rates[7:]:
         assert later.param_groups[0]["lr"] == pytest.approx(expected)
         later.step()

@@ -2,6 +2,7 @@
 
 import io
 from base64 import b64encode
+from collections.abc import Sequence
 from fractions import Fraction
 from html import escape
 from pathlib import Path
@@ -32,6 +33,13 @@ def video_figure(video: Path | str | bytes, sentence: str) -> str:
         "</video>"
     )
     return f"<figure style='margin:0'>{player}<figcaption style='{CAPTION_STYLE}'>{text}</figcaption></figure>"
+
+
+def side_by_side(videos: Sequence[np.ndarray]) -> np.ndarray:
+    """Join videos of one height, uint8 (T, H, W, 3), left to right; shorter ones repeat their last frame."""
+    longest = max(map(len, videos))
+    padded = [np.concatenate([frames, frames[-1:].repeat(longest - len(frames), axis=0)]) for frames in videos]
+    return np.concatenate(padded, axis=2)
 
 
 def _poster_and_length(content: bytes, name: str) -> tuple[bytes, float]:

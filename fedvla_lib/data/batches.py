@@ -62,10 +62,7 @@ class Batches:
 
     def rows_at(self, step: int) -> np.ndarray:
         """Return the store's rows in the batch of a gradient step, int64 (batch_size,)."""
-        return self._order(np.arange(step * self.batch_size, (step + 1) * self.batch_size))
-
-    def _order(self, positions: np.ndarray) -> np.ndarray:
-        """Return the rows at these positions of the concatenated epochs."""
+        positions = np.arange(step * self.batch_size, (step + 1) * self.batch_size)  # in the concatenated epochs
         epochs, offsets = np.divmod(positions, self.num_examples)
         indices = np.empty_like(positions)
         for epoch in np.unique(epochs):

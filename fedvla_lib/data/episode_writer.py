@@ -42,8 +42,7 @@ class EpisodeWriter:
     """Writes episodes through LeRobot into a staging folder and publishes each one when its files are closed."""
 
     def __init__(self, root: Path, settings: dict[str, Any], num_recorded: int) -> None:
-        self._has_labs = settings["num_labs"] > 1
-        self._root, self._staging, self._next = root, root / STAGING, num_recorded
+        self._root, self._staging = root, root / STAGING
         self._stats = [_stats_of(root, index) for index in range(num_recorded)]
         shutil.rmtree(self._staging, ignore_errors=True)
         av.logging.set_libav_level(av.logging.FATAL)  # no log per episode; errors are raised
@@ -64,27 +63,30 @@ class EpisodeWriter:
 
     def add(self, episode: Episode, lab: int) -> None:
         """Write one episode and publish it."""
-        lab_column = {LAB_KEY: np.array([lab], dtype=np.int64)} if self._has_labs else {}
+        columns = {STATE_KEY: episode.states, ACTION_KEY: episode.actions}
+        columns |= {image_key(camera): frames for camera, frames in episode.images.items()}
+        if LAB_KEY in self._dataset.features:
+            columns[LAB_KEY] = np.full((episode.num_frames, 1), lab, np.int64)
         with SuppressProgressBars():
-            for frame in _frames(episode):
-                self._dataset.add_frame(frame | lab_column)
+            for step in range(episode.num_frames):
+                row = {key: values[step] for key, values in columns.items()}
+                self._dataset.add_frame({"task": episode.instruction, **row})
             self._dataset.save_episode()
         # LeRobot closes these files only at the end of a recording, and until then they have no footer.
         self._dataset.writer.close_writer()
         self._dataset.meta._close_writer()
-        self._publish()
-        self._next += 1
+        self._publish(len(self._stats))
 
     def close(self) -> None:
         """Discard unpublished files."""
         self._dataset.finalize()
         shutil.rmtree(self._staging, ignore_errors=True)
 
-    def _publish(self) -> None:
-        for path in _episode_files(self._staging, self._next):
+    def _publish(self, index: int) -> None:
+        for path in _episode_files(self._staging, index):
             _put(path, self._root / path.relative_to(self._staging))
         # Unlike LeRobot's running aggregate, this does not depend on where a recording was interrupted.
-        self._stats.append(_stats_of(self._root, self._next))
+        self._stats.append(_stats_of(self._root, index))
         write_stats(aggregate_stats(self._stats), self._staging)
         for name in SHARED_FILES:
             _put(self._staging / name, self._root / name)
@@ -97,15 +99,6 @@ def _encoder() -> RGBEncoderConfig:
     """
     has_avx512 = pa.runtime_info().detected_simd_level == "avx512"
     return RGBEncoderConfig(**VIDEO, extra_options={"x264-params": f"asm={AVX2}"} if has_avx512 else {})
-
-
-def _frames(episode: Episode) -> list[dict[str, Any]]:
-    columns = {STATE_KEY: episode.states, ACTION_KEY: episode.actions}
-    columns |= {image_key(camera): frames for camera, frames in episode.images.items()}
-    return [
-        {"task": episode.instruction, **{key: values[step] for key, values in columns.items()}}
-        for step in range(episode.num_frames)
-    ]
 
 
 def _file_name(pattern: str, index: int) -> str:

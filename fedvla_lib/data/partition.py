@@ -6,16 +6,13 @@ with an episode as a row and its task as the label. This module does not know im
 
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from datasets import Dataset
 
 from fedvla_lib.config import PARTITIONS
-
-if TYPE_CHECKING:
-    from flwr_datasets.partitioner.partitioner import Partitioner
 
 MAX_DRAWS = 20  # seeds tried for a Dirichlet partition without an empty client; each draws up to 11 times
 
@@ -148,6 +145,7 @@ def _dirichlet(table: pd.DataFrame, num_clients: int, seed: int, alpha: float) -
     )
 
 
-def _ids(partitioner: "Partitioner", table: pd.DataFrame, num_clients: int) -> list[list[int]]:
+def _ids(partitioner: Any, table: pd.DataFrame, num_clients: int) -> list[list[int]]:
+    """Return the episodes that a partitioner of flwr-datasets gives each client."""
     partitioner.dataset = Dataset.from_pandas(table, preserve_index=False)
     return [list(partitioner.load_partition(client)["episode_id"]) for client in range(num_clients)]

@@ -8,6 +8,7 @@ episode. Episode i has its own files and seeds, so its content does not depend o
 
 import json
 import sys
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from fedvla_lib.robot.labs import labs
 from fedvla_lib.robot.rollout import Episode, run_episode
 from fedvla_lib.robot.sim import So100Env
 from fedvla_lib.robot.spec import CAMERAS, FPS
-from fedvla_lib.robot.stage import Stage, stage_of_process
+from fedvla_lib.robot.stage import stage_of_process
 from fedvla_lib.robot.tasks import check_tasks
 from fedvla_lib.workers import default_jobs, side_by_side
 
@@ -134,35 +135,28 @@ def _num_recorded(root: Path) -> int:
 def _record_missing(root: Path, settings: dict[str, Any], missing: range, progress: bool) -> None:
     """Record the episodes that are missing in `root`, in their order."""
     write_json(root / SETTINGS_FILE, settings)
-    done, total = missing.start, missing.stop
-    bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
-    recorder, waiting = EpisodeWriter(root, settings, done), {}
+    done, total, waiting = missing.start, missing.stop, {}
     jobs = default_jobs() if len(missing) >= WORTH_WORKERS else 1
-    stage = Stage(settings["image_size"], settings["jitter"])
-    demonstrate_one = partial(_demonstrated, settings, None if jobs > 1 else stage)
-    try:
-        for index, episode in side_by_side(demonstrate_one, missing, jobs):
-            waiting[index] = episode
-            while done in waiting:
-                recorder.add(*waiting.pop(done))
-                bar.update()
-                done += 1
-    except KeyboardInterrupt:
-        print(f"interrupted: {_num_recorded(root)} of {total} episodes are in {root}, "
-              "run the same command to continue", file=sys.stderr)  # fmt: skip
-        raise
-    finally:
-        bar.close()
-        recorder.close()
-        stage.close()
+    bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
+    stage = stage_of_process(settings["image_size"], settings["jitter"])
+    with closing(stage), closing(EpisodeWriter(root, settings, done)) as recorder, bar:
+        try:
+            for index, demonstrated in side_by_side(partial(_demonstrated, settings), missing, jobs):
+                waiting[index] = demonstrated
+                while done in waiting:
+                    recorder.add(*waiting.pop(done))
+                    bar.update()
+                    done += 1
+        except KeyboardInterrupt:
+            print(f"interrupted: {_num_recorded(root)} of {total} episodes are in {root}, "
+                  "run the same command to continue", file=sys.stderr)  # fmt: skip
+            raise
 
 
-def _demonstrated(settings: dict[str, Any], stage: Stage | None, index: int) -> tuple[Episode, int]:
+def _demonstrated(settings: dict[str, Any], index: int) -> tuple[Episode, int]:
     """Return an episode of a recording, and the number of the lab that it shows."""
     cycle, task_index = divmod(index, len(settings["tasks"]))
-    all_labs = labs(settings["num_labs"])
-    stage = stage or stage_of_process(settings["image_size"], settings["jitter"])
-    (env,) = stage.envs(settings["tasks"][task_index])
-    lab = cycle % len(all_labs)
-    env.lab = all_labs[lab]
+    lab = cycle % settings["num_labs"]
+    (env,) = stage_of_process(settings["image_size"], settings["jitter"]).envs(settings["tasks"][task_index])
+    env.lab = labs(settings["num_labs"])[lab]
     return demonstrate(env, index, settings["seed"]), lab

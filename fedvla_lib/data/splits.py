@@ -55,11 +55,6 @@ def held_out_episodes(store: FrameStore, config: Config) -> list[int]:
     return split(store, config.val_fraction, config.seed)[1]
 
 
-def num_frames(store: FrameStore, episode_ids: Sequence[int]) -> int:
-    """Return the number of frames in the given episodes."""
-    return sum(end - start for start, end in frame_spans(store, episode_ids))
-
-
 def tasks_of(store: FrameStore, episode_ids: Sequence[int]) -> list[str]:
     """Return the simulated tasks of the given episodes, in the order of `ALL_TASKS`."""
     held = set(store.episodes.set_index("episode_id").loc[list(episode_ids), "task"])
@@ -82,9 +77,3 @@ def _assign_held_out(table: pd.DataFrame, parts: list[list[int]], val_ids: Seque
         holders = [k for k, held in enumerate(tasks_held) if task[episode] in held] or range(len(parts))
         held_out[min(holders, key=lambda k: (len(held_out[k]), k))].append(episode)
     return held_out
-
-
-def frame_spans(store: FrameStore, episode_ids: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the (start, end) rows of each given episode, end excluded."""
-    rows = store.episodes.set_index("episode_id").loc[list(episode_ids)]
-    return list(zip(rows.start.astype(int), rows.end.astype(int), strict=True))

@@ -39,7 +39,6 @@ class Run:
 
 def read_run(folder: Path) -> Run:
     """Read from a run folder what is compared; raise ValueError if it is not one, or holds no measurements."""
-    folder = Path(folder)
     if not (folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a run folder: it has no config.json")
     config = run_folder.read_config(folder)

@@ -9,18 +9,12 @@ import torch
 from fedvla_lib.config import Config
 from fedvla_lib.data.batches import batch_of_rows
 from fedvla_lib.data.frame_store import FrameStore
-from fedvla_lib.data.splits import frame_spans
 from fedvla_lib.policy.actor import predict_chunk
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES
 
 VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly the same
 VALIDATION_BATCH = 32  # fixed, so that the noise does not depend on the batch size of training
-
-
-def validate(bundle: Bundle, batches: list[dict[str, Any]], *, tolerance: float, seed: int = 0) -> dict[str, float]:
-    """Return the averages of `measure_frames` over all frames of the batches."""
-    return average(measure_frames(bundle, batches, tolerance=tolerance, seed=seed))
 
 
 def measure_frames(
@@ -79,21 +73,9 @@ def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generato
     return loss.double().cpu().numpy()
 
 
-def held_out_frames(
-    bundle: Bundle, store: FrameStore, episode_ids: Sequence[int], config: Config
-) -> dict[str, np.ndarray]:
-    """Return `measure_frames` of every fifth frame of the episodes; nothing if there are no episodes."""
-    batches = held_out_batches(store, episode_ids, config)
-    if not batches:
-        return {}
-    return measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
-
-
-def by_episode(
-    frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]
-) -> list[dict[str, float]]:
-    """Return the averages of `held_out_frames` for each episode, with episode_id and num_examples."""
-    counts = [len(range(start, end, VALIDATION_STRIDE)) for start, end in frame_spans(store, episode_ids)]
+def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]) -> list[dict[str, float]]:
+    """Return the averages of measured `held_out_batches` for each episode, with episode_id and num_examples."""
+    counts = [len(rows) for rows in _measured_rows(store, episode_ids)]
     ends = np.cumsum(counts)
     return [
         {"episode_id": episode, "num_examples": n, **average({k: each[end - n : end] for k, each in frames.items()})}
@@ -103,6 +85,12 @@ def by_episode(
 
 def held_out_batches(store: FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:
     """Return raw batches of every fifth frame of the given episodes, without augmentation."""
-    rows = [row for start, end in frame_spans(store, episode_ids) for row in range(start, end, VALIDATION_STRIDE)]
+    rows = [row for episode in _measured_rows(store, episode_ids) for row in episode]
     cuts = range(0, len(rows), VALIDATION_BATCH)
     return [batch_of_rows(store, rows[i : i + VALIDATION_BATCH], config.chunk_size) for i in cuts]
+
+
+def _measured_rows(store: FrameStore, episode_ids: Sequence[int]) -> list[range]:
+    """Return every fifth row of each episode."""
+    table = store.episodes.set_index("episode_id").loc[list(episode_ids)]
+    return [range(start, end, VALIDATION_STRIDE) for start, end in zip(table.start, table.end, strict=True)]

@@ -11,7 +11,7 @@ from typing import Any
 from fedvla_lib.config import Config
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.data.splits import held_out_episodes
-from fedvla_lib.evaluation.held_out import average, by_episode, held_out_frames
+from fedvla_lib.evaluation.held_out import average, by_episode, held_out_batches, measure_frames
 from fedvla_lib.evaluation.rollouts import roll_out, success_rate
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.run_folder import RunFolder
@@ -52,9 +52,12 @@ def measure(
         jobs: processes that roll out at a time.
     """
     ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
-    frames = held_out_frames(bundle, store, ids, config)
+    episodes, averages = [], {}
+    if batches := held_out_batches(store, ids, config):
+        frames = measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
+        episodes, averages = by_episode(frames, store, ids), average(frames)
     rows = roll_out(bundle, config, seeds, videos_dir, progress, jobs) if len(seeds) else []
-    return Measurement(by_episode(frames, store, ids), average(frames) if frames else {}, rows)
+    return Measurement(episodes, averages, rows)
 
 
 def log_measurement(run: RunFolder, round_number: int, who: str, found: Measurement) -> None:

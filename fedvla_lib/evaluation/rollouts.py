@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import closing
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.rollout import Episode, act_in_turn, run_episodes
 from fedvla_lib.robot.spec import CAMERAS, Actor
-from fedvla_lib.robot.stage import Stage, stage_of_process
+from fedvla_lib.robot.stage import stage_of_process
 from fedvla_lib.workers import side_by_side
 
 AT_ONCE = 16  # rollouts that share one batch of policy inference
@@ -53,57 +52,42 @@ def evaluate(
         Rows: task, instruction, seed, lab (its name), success (bool), steps, completion_time_s (NaN for failures),
         action_smoothness (see `smoothness`) and video (path or None).
     """
-    setting, found = Setting(image_size, tuple(labs), videos_dir), {}
+    work, found = partial(_group, actor, image_size=image_size, labs=tuple(labs), videos_dir=videos_dir), {}
     groups = [(task, tuple(seeds[i : i + AT_ONCE])) for task in tasks for i in range(0, len(seeds), AT_ONCE)]
     bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
-    with bar, closing(Stage(image_size)) as stage:
-        work = partial(_group, actor, setting) if jobs > 1 else partial(_group, actor, setting, stage=stage)
+    with bar, closing(stage_of_process(image_size)):
         for group, rows in side_by_side(work, groups, jobs):
             found[group] = rows
             bar.update(len(group[1]))
     return [row for group in groups for row in found[group]]
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What the rollouts of an evaluation share."""
-
-    image_size: int
-    labs: tuple[Lab, ...]
-    videos_dir: Path | None
-
-
 def _group(
-    actor: Actor, setting: Setting, group: tuple[str, tuple[int, ...]], stage: Stage | None = None
+    actor: Actor, group: tuple[str, tuple[int, ...]], *, image_size: int, labs: Sequence[Lab], videos_dir: Path | None
 ) -> list[dict[str, Any]]:
     """Run rollouts of one task; an actor with `act_together` drives them all in one batch."""
     task, seeds = group
     together = getattr(actor, "act_together", act_in_turn)
-    envs = (stage or stage_of_process(setting.image_size)).envs(task, len(seeds))
+    envs = stage_of_process(image_size).envs(task, len(seeds))
     for env, seed in zip(envs, seeds, strict=True):
-        env.lab = setting.labs[seed % len(setting.labs)]  # a seed is the same scene whatever other seeds are run
-        env.cameras = CAMERAS if setting.videos_dir else ()  # none: render only what the actor observes
+        env.lab = labs[seed % len(labs)]  # a seed is the same scene whatever other seeds are run
+        env.cameras = CAMERAS if videos_dir else ()  # none: render only what the actor observes
     at_once = len(seeds) if together is not act_in_turn else 1
     episodes = []
     for i in range(0, len(seeds), at_once):
         actors = [actor] if at_once == 1 else [copy(actor) for _ in seeds]
         episodes += run_episodes(envs[i : i + at_once], actors, seeds[i : i + at_once], together)
-    labs = [env.lab.name for env in envs]
-    return [_row(episode, lab, setting.videos_dir) for episode, lab in zip(episodes, labs, strict=True)]
+    return [_row(episode, env.lab, videos_dir) for episode, env in zip(episodes, envs, strict=True)]
 
 
-def _row(episode: Episode, lab: str, videos_dir: Path | None) -> dict[str, Any]:
-    video = save_rollout(episode, Path(videos_dir)) if videos_dir else None
-    return row(episode) | {"lab": lab, "video": str(video) if video else None}
-
-
-def row(episode: Episode) -> dict[str, Any]:
-    """Return the row of one rollout, see `evaluate`."""
+def _row(episode: Episode, lab: Lab, videos_dir: Path | None) -> dict[str, Any]:
+    """Return the row of one rollout, see `evaluate`, and write its video."""
     return {
         "task": episode.task, "instruction": episode.instruction, "seed": episode.seed,
         "success": bool(episode.success), "steps": episode.num_frames,
         "completion_time_s": episode.duration_s if episode.success else float("nan"),
-        "action_smoothness": smoothness(episode.actions),
+        "action_smoothness": smoothness(episode.actions), "lab": lab.name,
+        "video": str(save_rollout(episode, Path(videos_dir))) if videos_dir else None,
     }  # fmt: skip
 
 

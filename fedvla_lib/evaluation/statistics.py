@@ -27,7 +27,11 @@ def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
 
 
 def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Wilson score interval of a success rate (Wilson 1927), in [0, 1]; raise ValueError for impossible counts."""
+    """Wilson score interval of a success rate (Wilson 1927), both ends in [0, 1].
+
+    Raises:
+        ValueError: no trials, or a number of successes that is not from 0 to `trials`.
+    """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"successes={successes} of trials={trials}: give 0 <= successes <= trials, trials > 0")
     low, high = proportion_confint(successes, trials, alpha=1 - confidence, method="wilson")

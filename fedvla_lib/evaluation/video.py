@@ -2,7 +2,6 @@
 
 import io
 import tempfile
-from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -20,7 +19,7 @@ def save_rollout(episode: Episode, folder: Path) -> Path:
     """Write video and trajectory of a rollout and return the video's path; existing files are never overwritten."""
     stamp = datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     path = folder / f"rollout_{stamp}_{episode.task}_{episode.seed}.mp4"
-    frames = side_by_side([episode.images[camera] for camera in CAMERAS])
+    frames = np.concatenate([episode.images[camera] for camera in CAMERAS], axis=2)  # side by side
     write_atomically(path, encode_video(frames.repeat(VIDEO_SCALE, axis=1).repeat(VIDEO_SCALE, axis=2)))
     trajectory = io.BytesIO()
     np.savez(trajectory, states=episode.states, actions=episode.actions, success=episode.success, seed=episode.seed)
@@ -28,14 +27,7 @@ def save_rollout(episode: Episode, folder: Path) -> Path:
     return path
 
 
-def side_by_side(videos: Sequence[np.ndarray]) -> np.ndarray:
-    """Join videos of one height, uint8 (T, H, W, 3), left to right; shorter ones repeat their last frame."""
-    longest = max(map(len, videos))
-    padded = [np.concatenate([frames, frames[-1:].repeat(longest - len(frames), axis=0)]) for frames in videos]
-    return np.concatenate(padded, axis=2)
-
-
-def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
+def encode_video(frames: np.ndarray) -> bytes:
     """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first.
 
     Raises:
@@ -50,7 +42,7 @@ def encode_video(frames: np.ndarray, fps: int = FPS) -> bytes:
         path = Path(scratch) / "video.mp4"
         with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
             quality = {"crf": "20", "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
-            stream = container.add_stream("libx264", rate=fps, options=quality)
+            stream = container.add_stream("libx264", rate=FPS, options=quality)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             for pixels in frames:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))

@@ -30,7 +30,6 @@ def read_videos(folder: Path) -> tuple[pd.DataFrame, list[str]]:
     Raises:
         ValueError: there is no such video.
     """
-    folder = Path(folder)
     videos = sorted({path.with_suffix(".mp4") for path in folder.glob("round_*/*/rollout_*.*")})
     if not videos:
         raise ValueError(f"{folder} holds no round_N/WHO/rollout_*.mp4: give the evaluate folder of a run")

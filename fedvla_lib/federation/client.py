@@ -17,7 +17,7 @@ from fedvla_lib.data import frame_store, splits
 from fedvla_lib.data.batches import Batches
 from fedvla_lib.data.normalisation import Stats, episode_stats, pack_stats, unpack_stats
 from fedvla_lib.data.recordings import open_frames
-from fedvla_lib.data.splits import Share, labs_of, num_frames, shares, tasks_of
+from fedvla_lib.data.splits import Share, labs_of, shares, tasks_of
 from fedvla_lib.evaluation.measure import measure
 from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
 from fedvla_lib.policy import model, prefix_cache, training
@@ -81,7 +81,7 @@ class Client:
     @property
     def num_examples(self) -> int:
         """Training frames: the client's weight in the average."""
-        return num_frames(self.store, self.share.train_ids)
+        return self.batches().num_examples
 
     def statistics(self) -> Stats:
         """Mean, standard deviation, range and count of state and action over the client's training episodes."""

@@ -11,8 +11,6 @@ import torch
 from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.lora import LoraLayer
 
-from fedvla_lib.policy.parameters import Arrays
-
 EXPERT = r"vlm_with_expert\.lm_expert\..*\.(q|v)_proj"
 PROJECTIONS = "action_in_proj|action_out_proj|action_time_mlp_in|action_time_mlp_out"
 A, B = ".lora_A.default.weight", ".lora_B.default.weight"
@@ -51,8 +49,3 @@ def merged(policy: torch.nn.Module) -> torch.nn.Module:
             parent, _, child = name.rpartition(".")
             setattr(result.get_submodule(parent), child, module.get_base_layer())
     return result
-
-
-def adapters(policy: torch.nn.Module) -> Arrays:
-    """Return all A and B matrices of a policy by name, float32, including frozen ones."""
-    return {name: p.detach().cpu().numpy().copy() for name, p in policy.named_parameters() if name.endswith((A, B))}

@@ -102,7 +102,7 @@ def local_train(
     use_threads(config, bundle.policy)
     began, loss = time.perf_counter(), objective.loss or flow_loss
     with _seeded(batches.seed, start.step):
-        optimizer, scheduler = _optimizer(bundle, config, start.step, start.total_steps or start.step + steps)
+        optimizer, scheduler = adamw(bundle, config, start.step, start.total_steps or start.step + steps)
         _load_moments(bundle, optimizer, start.moments or {})
         losses, taken, parameters = _restore(bundle, optimizer, scheduler, checkpoints), [], trainable(bundle.policy)
         optimizer.register_step_post_hook(lambda *_: taken.append(1))  # counts what the optimiser did
@@ -164,7 +164,7 @@ def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arr
         optimizer.state[named[name]][kind] = torch.from_numpy(value.copy()).to(device)
 
 
-def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
+def adamw(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
     """SmolVLA's AdamW and cosine-with-warm-up presets with the run's learning rate and length, at `start_step`."""
     settings = bundle.policy.config
     optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
@@ -178,12 +178,6 @@ def _optimizer(bundle: Bundle, config: Config, start_step: int, total_steps: int
     for group in optimizer.param_groups:
         group["lr"] = config.lr * scheduler.lr_lambdas[0](start_step)
     return optimizer, scheduler
-
-
-def learning_rates(bundle: Bundle, config: Config, *, steps: int) -> list[float]:
-    """Return the learning rate of each of `steps` gradient steps."""
-    _, scheduler = _optimizer(bundle, config, 0, steps)
-    return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
 
 
 @contextmanager

@@ -9,7 +9,6 @@ cubes, light and camera poses that vary between episodes. The result comes with 
 import hashlib
 import json
 import time
-from contextlib import closing
 from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
@@ -55,7 +54,6 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
         ValueError: a number in the recipe is not usable.
     """
     _check(recipe)
-    out = Path(out)
     if out.exists():
         raise FileExistsError(f"{out} exists already: give a folder that does not")
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -156,9 +154,9 @@ class _Misled(PolicyActor):
 
 
 def _seeds_with_two_cubes(task: str, count: int) -> list[int]:
-    with closing(So100Env(task, cameras=(), render_mode=None)) as env:
-        seeds = (seed for seed in rollout_seeds(20 * count) if env.reset(seed=seed) and len(env.layout.cubes) == 2)
-        return list(islice(seeds, count))
+    env = So100Env(task, cameras=(), render_mode=None)
+    seeds = (seed for seed in rollout_seeds(20 * count) if env.reset(seed=seed) and len(env.layout.cubes) == 2)
+    return list(islice(seeds, count))
 
 
 def _work_folder(recipe: Recipe) -> Path:

@@ -9,7 +9,7 @@ from numpy.lib.format import open_memmap
 from tqdm.auto import tqdm
 
 from fedvla_lib.files import new_folder
-from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M
+from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, Layout, Patch
 from fedvla_lib.robot.rendering import project
 from fedvla_lib.robot.sim import So100Env
 from fedvla_lib.robot.spec import CAMERAS
@@ -62,10 +62,11 @@ def _draw(folder: Path, count: int, size: int, rng: np.random.Generator, jitter:
         choices = [(), ZONES[:1], ZONES[1:], ZONES]
         envs = [stack.enter_context(closing(So100Env(replace(LOOK, zones=z), size, jitter=jitter))) for z in choices]
         for row in tqdm(range(count), desc="scenes", disable=not progress):
-            env = envs[rng.integers(len(envs))]
+            choice = rng.integers(len(choices))
+            env, zones = envs[choice], choices[choice]
             options = {} if rng.random() < AWAY_SHARE else {"joints": rng.uniform(POSE_FROM, POSE_TO)}
             observation, _ = env.reset(seed=int(rng.integers(2**31)), options=options)
-            places_m[row] = _places(env)
+            places_m[row] = _places(env.layout, zones)
             points_m = np.column_stack([places_m[row], HEIGHT_M])
             for index, camera in enumerate(CAMERAS):
                 images[camera][row] = observation["pixels"][camera]
@@ -76,11 +77,11 @@ def _draw(folder: Path, count: int, size: int, rng: np.random.Generator, jitter:
     np.save(folder / "shares.npy", shares)
 
 
-def _places(env: So100Env) -> np.ndarray:
-    """Positions of the objects on the table, (objects, 2)."""
+def _places(layout: Layout, zones: tuple[Patch, ...]) -> np.ndarray:
+    """Positions of the objects on the table, (objects, 2), metres."""
     places_m = np.full((len(OBJECTS), 2), np.nan)
-    for cube in env.layout.cubes:
+    for cube in layout.cubes:
         places_m[OBJECTS.index(f"{cube.color} cube")] = cube.xy_m
-    for zone, xy_m in zip(env.zones, env.layout.zones_xy_m, strict=True):
+    for zone, xy_m in zip(zones, layout.zones_xy_m, strict=True):
         places_m[len(CUBES) + ZONES.index(zone)] = xy_m
     return places_m

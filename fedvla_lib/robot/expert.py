@@ -6,7 +6,6 @@ and the joint positions.
 """
 
 from collections.abc import Callable, Iterable
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -62,8 +61,8 @@ class Expert:
         """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not used."""
         sim: So100Env = env.unwrapped
         self._offset = sim.joint_offset  # the plan is in true angles, commands are in reported ones
-        start = self._arm.start(sim.joints - self._offset)
-        self._path = _interpolate(start, PLANS[sim.task](sim.layout, start))
+        start = _Plan([self._arm.start(sim.joints - self._offset)])
+        self._path = _interpolate(PLANS[sim.task](start, sim.layout, sim.layout.cubes[0]))
         self._step = 0
 
     def act(self, observation: Observation) -> np.ndarray:
@@ -75,10 +74,9 @@ class Expert:
 
 def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
     """Run the expert without cameras on each seed; rows with task, seed, success and steps."""
-    expert = Expert()
-    with closing(So100Env(task, cameras=(), render_mode=None)) as env:
-        episodes = (run_episode(env, expert, seed) for seed in tqdm(seeds, desc=f"expert {task}", disable=None))
-        return [{"task": task, "seed": e.seed, "success": e.success, "steps": e.num_frames} for e in episodes]
+    env, expert = So100Env(task, cameras=(), render_mode=None), Expert()
+    episodes = (run_episode(env, expert, seed) for seed in tqdm(seeds, desc=f"expert {task}", disable=None))
+    return [{"task": task, "seed": e.seed, "success": e.success, "steps": e.num_frames} for e in episodes]
 
 
 class _Arm:
@@ -115,10 +113,10 @@ class _Arm:
         return joints
 
 
-def _interpolate(start: Waypoint, plan: list[Waypoint]) -> list[Waypoint]:
+def _interpolate(plan: list[Waypoint]) -> list[Waypoint]:
     """Return one waypoint per control step, along straight lines with smooth acceleration and braking."""
     path = []
-    for begin, end in pairwise([start, *plan]):
+    for begin, end in pairwise(plan):
         before, after = (np.array([*one.position_m, one.yaw_rad, one.gripper]) for one in (begin, end))
         for progress in (_smooth(step / end.steps) for step in range(1, end.steps + 1)):
             *position_m, yaw_rad, gripper = (1 - progress) * before + progress * after
@@ -130,18 +128,58 @@ def _smooth(progress: float) -> float:
     return progress * progress * (3 - 2 * progress)
 
 
-def _move(begin: Waypoint, position_m: Point, yaw_rad: float, gripper: float) -> Waypoint:
-    """Return a waypoint whose number of steps follows from the distance."""
-    distance_m = float(np.linalg.norm(np.subtract(position_m, begin.position_m)))
-    return Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M)))
+class _Plan(list[Waypoint]):
+    """Waypoints, the first of them where the gripper is; every method appends some and returns the plan."""
 
+    def move(self, position_m: Point, yaw_rad: float, gripper: float) -> "_Plan":
+        """Go straight to `position_m`; the number of steps follows from the distance."""
+        distance_m = float(np.linalg.norm(np.subtract(position_m, self[-1].position_m)))
+        self.append(Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M))))
+        return self
 
-def _grasp(start: Waypoint, cube: Cube, height_m: float = GRASP_HEIGHT_M) -> list[Waypoint]:
-    """Hover over the cube, descend, close."""
-    around = _sidestep(*cube.xy_m, cube.yaw_rad)
-    hover = _move(start, (*around, HOVER_HEIGHT_M), cube.yaw_rad, OPEN)
-    down = _move(hover, (*around, height_m), cube.yaw_rad, OPEN)
-    return [hover, down, Waypoint((*cube.xy_m, height_m), cube.yaw_rad, CLOSED, CLOSE_STEPS)]
+    def arc(self, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> "_Plan":
+        """Go along an arc around the base to `end_xy_m`, one waypoint per control step; the gripper turns along."""
+        begin = self[-1]
+        x, y, z = begin.position_m
+        (radius_m, bearing_rad), (end_radius_m, end_bearing_rad) = _polar(x, y), _polar(*end_xy_m)
+        turn_rad = end_bearing_rad - bearing_rad
+        steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / SPEED_M))
+        for progress in (_smooth(step / steps) for step in range(1, steps + 1)):
+            point_m = cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
+            position_m = (*point_m, z + progress * (height_m - z))
+            self.append(Waypoint(position_m, begin.yaw_rad + progress * turn_rad, gripper, 1))
+        return self
+
+    def grasp(self, cube: Cube, height_m: float = GRASP_HEIGHT_M) -> "_Plan":
+        """Hover over the cube, descend, close."""
+        around = _sidestep(*cube.xy_m, cube.yaw_rad)
+        self.move((*around, HOVER_HEIGHT_M), cube.yaw_rad, OPEN).move((*around, height_m), cube.yaw_rad, OPEN)
+        self.append(Waypoint((*cube.xy_m, height_m), cube.yaw_rad, CLOSED, CLOSE_STEPS))
+        return self
+
+    def carry(self, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> "_Plan":
+        """Grasp the cube, carry it along an arc, set it down with the hand at `height_m`, release, rise."""
+        self.grasp(cube).move((*cube.xy_m, CARRY_HEIGHT_M), cube.yaw_rad, CLOSED).arc(to_xy_m, CARRY_HEIGHT_M, CLOSED)
+        yaw_rad = self[-1].yaw_rad
+        around = _sidestep(*to_xy_m, yaw_rad)
+        self.move((*to_xy_m, height_m), yaw_rad, CLOSED)
+        self.append(Waypoint((*around, height_m), yaw_rad, OPEN, OPEN_STEPS))
+        return self.move((*around, height_m + RISE_M), yaw_rad, OPEN)
+
+    def sweep(self, cube: Cube, radius_m: float, bearing_rad: float) -> "_Plan":
+        """Come down beside the cube with the jaws as a fork and push it along an arc to the given polar position."""
+        cube_radius_m, cube_rad = _polar(*cube.xy_m)
+        side = np.sign(bearing_rad - cube_rad)  # 1 sweeps to the left
+        beside_rad = cube_rad - side * FORK_GAP_M / cube_radius_m
+        yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
+        beside = cartesian(cube_radius_m, beside_rad)
+        end = cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
+        self.move((*beside, HOVER_HEIGHT_M), yaw_rad, FORK).move((*beside, PUSH_HEIGHT_M), yaw_rad, FORK)
+        return self.arc(end, PUSH_HEIGHT_M, FORK)
+
+    def point(self, xy_m: tuple[float, float]) -> "_Plan":
+        """Move the open hand over a point of the table."""
+        return self.move((*xy_m, POINT_HEIGHT_M), _polar(*xy_m)[1], OPEN)
 
 
 def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
@@ -149,93 +187,35 @@ def _sidestep(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
     return x - SIDESTEP_M * np.sin(yaw_rad), y + SIDESTEP_M * np.cos(yaw_rad)
 
 
-def _carry(start: Waypoint, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> list[Waypoint]:
-    """Grasp the cube, carry it along an arc around the base, set it down with the hand at `height_m`, release, rise."""
-    path = _grasp(start, cube)
-    path.append(_move(path[-1], (*cube.xy_m, CARRY_HEIGHT_M), cube.yaw_rad, CLOSED))
-    path += _arc(path[-1], to_xy_m, CARRY_HEIGHT_M, CLOSED)
-    yaw_rad = path[-1].yaw_rad
-    path.append(_move(path[-1], (*to_xy_m, height_m), yaw_rad, CLOSED))
-    around = _sidestep(*to_xy_m, yaw_rad)
-    path.append(Waypoint((*around, height_m), yaw_rad, OPEN, OPEN_STEPS))
-    return [*path, _move(path[-1], (*around, height_m + RISE_M), yaw_rad, OPEN)]
-
-
-def _sweep(start: Waypoint, cube: Cube, radius_m: float, bearing_rad: float) -> list[Waypoint]:
-    """Come down beside the cube with the jaws as a fork and push it along an arc to the given polar position."""
-    cube_radius_m, cube_rad = _polar(*cube.xy_m)
-    side = np.sign(bearing_rad - cube_rad)  # 1 sweeps to the left
-    beside_rad = cube_rad - side * FORK_GAP_M / cube_radius_m
-    yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
-    beside = cartesian(cube_radius_m, beside_rad)
-    hover = _move(start, (*beside, HOVER_HEIGHT_M), yaw_rad, FORK)
-    down = _move(hover, (*beside, PUSH_HEIGHT_M), yaw_rad, FORK)
-    end = cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
-    return [hover, down, *_arc(down, end, PUSH_HEIGHT_M, FORK)]
-
-
-def _grasp_and_move(start: Waypoint, cube: Cube, to_m: Point, height_m: float = GRASP_HEIGHT_M) -> list[Waypoint]:
-    path = _grasp(start, cube, height_m)
-    return [*path, _move(path[-1], to_m, cube.yaw_rad, CLOSED)]
-
-
-def _sort_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    path: list[Waypoint] = []
-    for cube, zone_xy_m in zip(layout.cubes, layout.zones_xy_m, strict=True):
-        path += _carry(path[-1] if path else start, cube, zone_xy_m, GRASP_HEIGHT_M)
-    return path
-
-
-def _drag_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    path = _grasp(start, layout.cubes[0], DRAG_HEIGHT_M)
-    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
-    return path + _arc(path[-1], cartesian(radius_m, bearing_rad - DRAG_RAD), DRAG_HEIGHT_M, CLOSED)
-
-
-def _pull_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
-    nearer_m = (*cartesian(radius_m - PULL_M, bearing_rad), DRAG_HEIGHT_M)
-    return _grasp_and_move(start, layout.cubes[0], nearer_m, DRAG_HEIGHT_M)
-
-
-def _nudge_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    radius_m, bearing_rad = _polar(*layout.cubes[0].xy_m)
-    return _sweep(start, layout.cubes[0], radius_m, bearing_rad - NUDGE_RAD)
-
-
-def _point_plan(layout: Layout, start: Waypoint) -> list[Waypoint]:
-    return [_move(start, (*layout.zone_xy_m, POINT_HEIGHT_M), _polar(*layout.zone_xy_m)[1], OPEN)]
-
-
-def _arc(begin: Waypoint, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> list[Waypoint]:
-    """Return an arc around the base to `end_xy_m`, one waypoint per control step; the gripper turns along."""
-    x, y, z = begin.position_m
-    (radius_m, bearing_rad), (end_radius_m, end_bearing_rad) = _polar(x, y), _polar(*end_xy_m)
-    turn_rad = end_bearing_rad - bearing_rad
-    steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / SPEED_M))
-    path = []
-    for step in range(1, steps + 1):
-        progress = _smooth(step / steps)
-        point_m = cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
-        position_m = (*point_m, z + progress * (height_m - z))
-        path.append(Waypoint(position_m, begin.yaw_rad + progress * turn_rad, gripper, 1))
-    return path
-
-
 def _polar(x: float, y: float) -> tuple[float, float]:
     """Radius in metres and bearing in radians, around the arm's first joint."""
     return float(np.hypot(x, y)), float(np.arctan2(y, x))
 
 
-PLANS: dict[str, Callable[[Layout, Waypoint], list[Waypoint]]] = {
-    "lift": lambda layout, start: _grasp_and_move(start, layout.cubes[0], (*layout.cubes[0].xy_m, LIFT_HEIGHT_M)),
-    "place": lambda layout, start: _carry(start, layout.cubes[0], layout.zone_xy_m, GRASP_HEIGHT_M),
-    "push": lambda layout, start: _sweep(start, layout.cubes[0], *_polar(*layout.zone_xy_m)),
-    "stack": lambda layout, start: _carry(start, layout.cubes[0], layout.cubes[1].xy_m, STACK_HEIGHT_M),
-    "sort": _sort_plan,
-    "reach": lambda layout, start: [
-        _move(start, (*layout.cubes[0].xy_m, REACH_HEIGHT_M), layout.cubes[0].yaw_rad, OPEN)],
-    "grip": lambda layout, start: _grasp(start, layout.cubes[0]),
-    "drag": _drag_plan, "pull": _pull_plan, "nudge": _nudge_plan,
-    "point_square": _point_plan, "point_circle": _point_plan,
-}  # fmt: skip
+def _beside(cube: Cube, farther_m: float, turn_rad: float) -> tuple[float, float]:
+    """Polar position of the cube, changed by these; a positive angle turns to the left."""
+    radius_m, bearing_rad = _polar(*cube.xy_m)
+    return radius_m + farther_m, bearing_rad + turn_rad
+
+
+# By task: extends the plan that holds the start, for a layout and its first cube.
+PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
+    "lift": lambda plan, layout, cube: plan.grasp(cube).move((*cube.xy_m, LIFT_HEIGHT_M), cube.yaw_rad, CLOSED),
+    "place": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M),
+    "push": lambda plan, layout, cube: plan.sweep(cube, *_polar(*layout.zones_xy_m[0])),
+    "stack": lambda plan, layout, cube: plan.carry(cube, layout.cubes[1].xy_m, STACK_HEIGHT_M),
+    "sort": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
+        layout.cubes[1], layout.zones_xy_m[1], GRASP_HEIGHT_M
+    ),
+    "reach": lambda plan, layout, cube: plan.move((*cube.xy_m, REACH_HEIGHT_M), cube.yaw_rad, OPEN),
+    "grip": lambda plan, layout, cube: plan.grasp(cube),
+    "drag": lambda plan, layout, cube: plan.grasp(cube, DRAG_HEIGHT_M).arc(
+        cartesian(*_beside(cube, 0.0, -DRAG_RAD)), DRAG_HEIGHT_M, CLOSED
+    ),
+    "pull": lambda plan, layout, cube: plan.grasp(cube, DRAG_HEIGHT_M).move(
+        (*cartesian(*_beside(cube, -PULL_M, 0.0)), DRAG_HEIGHT_M), cube.yaw_rad, CLOSED
+    ),
+    "nudge": lambda plan, layout, cube: plan.sweep(cube, *_beside(cube, 0.0, -NUDGE_RAD)),
+    "point_square": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
+    "point_circle": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
+}

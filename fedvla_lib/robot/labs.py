@@ -34,12 +34,12 @@ class Lab:
 REFERENCE = Lab()
 
 
-def labs(count: int, seed: int = 0) -> list[Lab]:
-    """Return the reference lab and `count - 1` others; lab k does not depend on `count`.
+def labs(count: int) -> list[Lab]:
+    """Return the reference lab and `count - 1` others; lab k depends on k only.
 
-    Runs leave `seed` at 0, so that a recording and later runs with other seeds use the same labs.
+    So a recording and later runs, whatever their seed, use the same labs.
     """
-    return [REFERENCE, *(draw_lab(f"lab_{k}", np.random.default_rng([seed, k])) for k in range(1, count))]
+    return [REFERENCE, *(draw_lab(f"lab_{k}", np.random.default_rng([0, k])) for k in range(1, count))]
 
 
 def draw_lab(name: str, rng: np.random.Generator, spread: float = 1.0, offsets: bool = True) -> Lab:

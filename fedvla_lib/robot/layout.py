@@ -49,17 +49,7 @@ class Layout:
 
     instruction: str
     cubes: tuple[Cube, ...]  # the first is the one to move
-    zones_xy_m: tuple[tuple[float, float], ...]  # the first belongs to the first cube
-
-    @property
-    def color(self) -> str:
-        """Colour of the first cube."""
-        return self.cubes[0].color
-
-    @property
-    def zone_xy_m(self) -> tuple[float, float] | None:
-        """Centre of the first zone; None without a zone."""
-        return self.zones_xy_m[0] if self.zones_xy_m else None
+    zones_xy_m: tuple[tuple[float, float], ...]  # centres; the first zone belongs to the first cube
 
 
 MAX_CUBE_YAW_RAD = np.deg2rad(25.0)  # largest angle between a cube face and the direction from the base

@@ -6,7 +6,7 @@ LeRobot imports the module named by its plugin flag before it parses the rest of
         --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -31,22 +31,15 @@ class So100SimConfig(EnvConfig):
     fps: int = FPS
     image_size: int = 96  # side of the square camera images in pixels
     render_mode: str = "rgb_array"
-    features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_tasks(self.task_names)
+        check_tasks(split_names(self.task))
         action = PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))
         state = PolicyFeature(type=FeatureType.STATE, shape=(NUM_JOINTS,))
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         self.features = {ACTION: action, "agent_pos": state, **{f"pixels/{camera}": image for camera in CAMERAS}}
         images = {f"pixels/{camera}": image_key(camera) for camera in CAMERAS}
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, **images}
-
-    @property
-    def task_names(self) -> list[str]:
-        """The tasks to evaluate."""
-        return split_names(self.task)
 
     @property
     def gym_id(self) -> str:
@@ -64,5 +57,5 @@ class So100SimConfig(EnvConfig):
         """Return ``{task: {0: vector environment}}``, one entry per task."""
         return {
             name: EnvConfig.create_envs(replace(self, task=name), n_envs, use_async_envs)[self.type]
-            for name in self.task_names
+            for name in split_names(self.task)
         }

@@ -18,7 +18,6 @@ class Episode:
 
     task: str
     instruction: str
-    color: str
     seed: int
     states: np.ndarray  # float32 (T, 6), LeRobot units
     actions: np.ndarray  # float32 (T, 6), joint targets given by the actor
@@ -75,7 +74,7 @@ def run_episodes(
 
 
 class LazyObservation(dict):
-    """An observation whose images are rendered on first access, from the state of the scene at that moment."""
+    """An observation whose images, if it lacks them, are rendered on first access, as the scene is at that moment."""
 
     def __init__(self, observation: Observation, env: "So100Env") -> None:
         super().__init__(observation)
@@ -93,7 +92,7 @@ class RunningEpisode:
 
     def __init__(self, env: "So100Env", actor: Actor, seed: int) -> None:
         self.env, self.actor, self.seed = env, actor, seed
-        self.observation = self._observed(env.reset(seed=seed)[0])
+        self.observation = LazyObservation(env.reset(seed=seed)[0], env.unwrapped)
         actor.reset(env, seed)
         self.over = self._success = False
         self._observations: list[Observation] = []
@@ -103,17 +102,13 @@ class RunningEpisode:
         self._observations.append(self.observation)
         self._actions.append(action)
         observation, _, terminated, truncated, info = self.env.step(action)
-        self.observation = self._observed(observation)
+        self.observation = LazyObservation(observation, self.env.unwrapped)
         self.over, self._success = terminated or truncated, bool(info["is_success"])
-
-    def _observed(self, observation: Observation) -> Observation:
-        sim = self.env.unwrapped
-        return observation if sim.cameras else LazyObservation(observation, sim)
 
     def result(self) -> Episode:
         sim = self.env.unwrapped
         return Episode(
-            task=sim.task, instruction=sim.instruction, color=sim.layout.color, seed=self.seed, success=self._success,
+            task=sim.task, instruction=sim.instruction, seed=self.seed, success=self._success,
             states=np.stack([frame["agent_pos"] for frame in self._observations]).reshape(-1, NUM_JOINTS),
             actions=np.stack(self._actions),
             images={name: np.stack([frame["pixels"][name] for frame in self._observations]) for name in sim.cameras},

@@ -8,7 +8,7 @@ The package is located, not imported: importing it would import dm_control.
 import mujoco
 import numpy as np
 
-from fedvla_lib.robot.labs import Lab
+from fedvla_lib.robot.labs import REFERENCE, Lab
 from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, Layout, Patch
 from fedvla_lib.robot.meshes import assets_dir, decimated_meshes
 from fedvla_lib.robot.spec import CAMERAS, JOINT_NAMES
@@ -43,9 +43,10 @@ def build_arm() -> mujoco.MjModel:
 
 
 def build_scene(task: Task, image_size: int) -> mujoco.MjModel:
-    """Return the model of arm, table, the task's cubes and zones, two cameras and the light.
+    """Return the model of arm, table, the task's cubes and zones, two cameras and the light, in the reference lab.
 
-    `image_size` is the side of the largest image that will be rendered, in pixels.
+    `image_size` is the side of the largest image that will be rendered, in pixels. Cubes are out of sight until
+    `place_objects` places them.
     """
     spec = _arm_spec()
     _add_world(spec, image_size)
@@ -54,8 +55,10 @@ def build_scene(task: Task, image_size: int) -> mujoco.MjModel:
     for name, zone in zip(ZONES, task.zones, strict=False):
         _add_zone(spec, name, zone)
     for name in CAMERAS:
-        _add_camera(spec, name)
-    return spec.compile()
+        spec.worldbody.add_camera(name=name, fovy=CAMERA_POSES[name][2])
+    model = spec.compile()
+    apply_lab(model, REFERENCE)
+    return model
 
 
 def _arm_spec() -> mujoco.MjSpec:
@@ -108,7 +111,6 @@ def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
     visual = spec.visual
     visual.global_.offwidth = visual.global_.offheight = image_size
     visual.quality.offsamples = 0  # multisampling and shadows make rendering six times slower
-    visual.headlight.ambient, visual.headlight.diffuse = (AMBIENT,) * 3, (HEADLIGHT,) * 3
     visual.headlight.specular = (0,) * 3
     visual.map.znear, visual.map.zfar = 0.02, 10.0
     spec.stat.extent, spec.stat.center = 1.0, (0.2, 0.0, 0.0)
@@ -120,7 +122,7 @@ def _add_world(spec: mujoco.MjSpec, image_size: int) -> None:
     _add_table(world)
     world.add_light(
         name=LIGHT, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=(0.3, 0.5, 1.5), dir=(-0.2, -0.4, -1.0),
-        diffuse=(LAMP,) * 3, specular=(0,) * 3, castshadow=False,
+        specular=(0,) * 3, castshadow=False,
     )  # fmt: skip
 
 
@@ -130,9 +132,9 @@ def _add_table(world: mujoco.MjsBody) -> None:
     MuJoCo draws a plane as a grid of cells with the third size as their side: 3844 triangles for 1 cm, more than a
     third of all. Only the far edge, the one that a camera sees, is a row of such cells: its pixels depend on them.
     """
-    look = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, rgba=(*TABLE_RGB, 1.0))
-    world.add_geom(name=TABLE, pos=(0.0025, 0.0, 0.0), size=(0.5975, 0.6, 1.2), **look)
-    world.add_geom(name=TABLE_EDGE, pos=(-0.595, 0.0, 0.0), size=(0.005, 0.6, 0.01), contype=0, conaffinity=0, **look)
+    plane, edge = mujoco.mjtGeom.mjGEOM_PLANE, (0.005, 0.6, 0.01)
+    world.add_geom(name=TABLE, type=plane, pos=(0.0025, 0.0, 0.0), size=(0.5975, 0.6, 1.2))
+    world.add_geom(name=TABLE_EDGE, type=plane, pos=(-0.595, 0.0, 0.0), size=edge, contype=0, conaffinity=0)
 
 
 def _add_cube(spec: mujoco.MjSpec, name: str) -> None:
@@ -153,13 +155,6 @@ def _add_zone(spec: mujoco.MjSpec, name: str, zone: Patch) -> None:
         size=(half, half, 0.0008) if box else (half, 0.0008, 0.0),
         rgba=(*ZONE_RGB[zone.shape], 1.0), contype=0, conaffinity=0,
     )  # fmt: skip
-
-
-def _add_camera(spec: mujoco.MjSpec, name: str) -> None:
-    position_m, target_m, fovy_deg = CAMERA_POSES[name]
-    camera = spec.worldbody.add_camera(name=name, pos=position_m, fovy=fovy_deg)
-    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
-    camera.alt.xyaxes = _look_at(position_m, target_m).T[:2].ravel()
 
 
 def _look_at(position_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
@@ -187,22 +182,13 @@ def apply_lab(model: mujoco.MjModel, lab: Lab) -> None:
 
 
 def place_objects(model: mujoco.MjModel, data: mujoco.MjData, layout: Layout, lab: Lab) -> None:
-    """Place cubes and zones as in `layout`; a second cube that the layout lacks goes out of sight."""
-    for index, name in enumerate(cubes_of(model)):
-        if index >= len(layout.cubes):
-            data.joint(name).qpos[:] = (*OUT_OF_SIGHT_M, CUBE_HALF_M, 1.0, 0.0, 0.0, 0.0)
-            continue
-        cube = layout.cubes[index]
+    """Place cubes and zones as in `layout`, after a reset of `data`; a cube that it lacks stays out of sight."""
+    for name, cube in zip(CUBES, layout.cubes, strict=False):
         half_yaw = cube.yaw_rad / 2
         data.joint(name).qpos[:] = (*cube.xy_m, CUBE_HALF_M, np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw))
         model.geom(name).rgba[:3] = _recolored(COLORS[cube.color], lab.paint_change)
     for index, xy_m in enumerate(layout.zones_xy_m):
         data.mocap_pos[index] = (*xy_m, 0.0)
-
-
-def cubes_of(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the cubes in a scene."""
-    return [name for name in CUBES if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0]
 
 
 def _recolored(rgb: tuple[float, float, float], change: tuple[float, float, float]) -> np.ndarray:

@@ -13,7 +13,7 @@ turns to the arm's left, positive shoulder_lift leans forward, positive elbow_fl
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -23,8 +23,8 @@ from gymnasium import spaces
 
 from fedvla_lib.robot import scene
 from fedvla_lib.robot.labs import REFERENCE, Lab, draw_lab
-from fedvla_lib.robot.layout import CUBE_HALF_M, Patch
-from fedvla_lib.robot.rendering import SceneRenderer, open_renderer
+from fedvla_lib.robot.layout import CUBE_HALF_M
+from fedvla_lib.robot.rendering import SceneRenderer
 from fedvla_lib.robot.spec import CAMERAS, FPS, NUM_JOINTS, Observation
 from fedvla_lib.robot.tasks import ALL_TASKS, CARRY_CLEARANCE_M, Task, TaskState, check_tasks, draw_layout
 
@@ -86,7 +86,9 @@ class So100Env(gymnasium.Env):
         self._renderer: SceneRenderer | None = None
         # Never self: a reference cycle would be freed late, in any thread.
         self._renderer_of = renderer_of and (renderer_of._renderer_of or renderer_of)
-        self.action_space = spaces.Box(*self._range(), dtype=np.float32)
+        self._limits_rad = self.model.jnt_range[:NUM_JOINTS]  # (6, 2)
+        low, high = (from_radians(ends_rad, self._limits_rad) for ends_rad in self._limits_rad.T)
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = self._observation_space()
         self._touches = _touches(self.model)
         self.layout = draw_layout(self._task, np.random.default_rng(0))
@@ -97,30 +99,17 @@ class So100Env(gymnasium.Env):
         """The instruction of this episode."""
         return self.layout.instruction
 
-    @property
-    def zones(self) -> tuple[Patch, ...]:
-        """The task's zones, in the order of the layout."""
-        return self._task.zones
-
-    @property
-    def task_description(self) -> str:
-        """The instruction, under the name used by LeRobot's evaluation."""
-        return self.instruction
+    task_description = instruction  # the name used by LeRobot's evaluation
 
     @property
     def joints(self) -> np.ndarray:
         """Reported joint positions, with calibration error, float32 (6,), LeRobot units."""
-        return from_radians(self.data.qpos[:NUM_JOINTS], self.model.jnt_range[:NUM_JOINTS]) + self.joint_offset
+        return from_radians(self.data.qpos[:NUM_JOINTS], self._limits_rad) + self.joint_offset
 
     @property
     def joint_offset(self) -> np.ndarray:
         """Calibration error: reported minus true joint positions, float32 (6,), LeRobot units."""
         return np.append(self.lab.joint_offset_deg, 0.0).astype(np.float32)
-
-    @property
-    def cube_m(self) -> np.ndarray:
-        """Centre of the first cube in the world frame, float64 (3,)."""
-        return self.data.body(scene.CUBES[0]).xpos.copy()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Start an episode.
@@ -140,14 +129,15 @@ class So100Env(gymnasium.Env):
         mujoco.mj_resetData(self.model, self.data)
         scene.apply_lab(self.model, self.lab)
         home = HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, NUM_JOINTS)
-        self._put_arm(_check_joints(options.get("joints", home), "joints"))
+        start = _check_joints(options.get("joints", home), "joints")
+        self.data.qpos[:NUM_JOINTS] = self.data.ctrl[:] = to_radians(start, self._limits_rad)
         scene.place_objects(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
         self._step_count = self._streak = 0
-        cubes = scene.cubes_of(self.model)[: len(self.layout.cubes)]
-        self._histories = [_CubeHistory(tuple(self.data.body(name).xpos.tolist())) for name in cubes]
+        cubes = scene.CUBES[: len(self.layout.cubes)]
+        self._states = [TaskState(start_m=tuple(self.data.body(name).xpos.tolist())) for name in cubes]
         self._needs_reset = False
-        return self._observation(), self._info()
+        return self._observation(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
         """Move towards the joint targets `action` for one control step.
@@ -160,21 +150,24 @@ class So100Env(gymnasium.Env):
         if self._needs_reset:
             raise RuntimeError("the episode is over: call reset() before step()")
         low, high = self.action_space.low, self.action_space.high
-        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self.model.jnt_range[:NUM_JOINTS])
+        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self._limits_rad)
         touched = self._advance()
-        task = self._task
         now = self._touching()
-        first, *others = (self._measure(index, touched, now) for index in range(len(self._histories)))
-        self._streak = self._streak + 1 if task.success(replace(first, others=tuple(others))) else 0
+        self._states = [self._measure(index, before, touched, now) for index, before in enumerate(self._states)]
+        first, *others = self._states
+        self._streak = self._streak + 1 if self._task.success(replace(first, others=tuple(others))) else 0
         self._step_count += 1
-        terminated = self._streak >= task.hold_steps
+        terminated = self._streak >= self._task.hold_steps
         truncated = not terminated and self._step_count >= self._max_episode_steps
         self._needs_reset = terminated or truncated
-        return self._observation(), float(terminated), terminated, truncated, self._info()
+        return self._observation(), float(terminated), terminated, truncated, {"is_success": terminated}
 
     def camera_images(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
         """Render the current scene: camera -> uint8 (size, size, 3)."""
-        return {camera: self._draw(camera) for camera in cameras}
+        owner = self._renderer_of or self
+        if owner._renderer is None:
+            owner._renderer = SceneRenderer(owner.model, owner.image_size)
+        return {camera: owner._renderer.draw(self.model, self.data, camera) for camera in cameras}
 
     def render(self) -> np.ndarray | None:
         """Return all cameras side by side, uint8 (size, 2 * size, 3); None without a render mode."""
@@ -187,11 +180,6 @@ class So100Env(gymnasium.Env):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-    def _put_arm(self, joints: np.ndarray) -> None:
-        radians = to_radians(joints, self.model.jnt_range[:NUM_JOINTS])
-        self.data.qpos[:NUM_JOINTS] = radians
-        self.data.ctrl[:] = radians
 
     def _advance(self) -> set[tuple[str, str]]:
         """Simulate one control step; return what touched during it, see `_touching`."""
@@ -207,24 +195,25 @@ class So100Env(gymnasium.Env):
         touches = self._touches  # a dict of Python numbers: this runs 20 times a control step, on a few contacts
         return {touches[pair] for pair in map(tuple, self.data.contact.geom.tolist()) if pair in touches}
 
-    def _measure(self, index: int, touched: set[tuple[str, str]], now: set[tuple[str, str]]) -> TaskState:
-        """Update the history of one cube and return the input of the success predicates.
+    def _measure(
+        self, index: int, before: TaskState, touched: set[tuple[str, str]], now: set[tuple[str, str]]
+    ) -> TaskState:
+        """Return the input of the success predicates for one cube, whose state a control step earlier was `before`.
 
         `touched`: contacts during the control step, `now`: at its end, both as `_touching` returns them.
         """
-        name, history = scene.CUBES[index], self._histories[index]
+        name = scene.CUBES[index]
         parts, cube_m = {part for cube, part in now if cube == name}, tuple(self.data.body(name).xpos.tolist())
         hand_m = tuple(self.data.site(scene.GRASP_SITE).xpos.tolist())
         held, clearance_m = {"fixed", "moving"} <= parts, cube_m[2] - CUBE_HALF_M
         speed_mps = float(np.linalg.norm(self.data.joint(name).qvel[:3]))
-        history.peak_clearance_m = max(history.peak_clearance_m, clearance_m)
-        history.carried |= held and clearance_m > CARRY_CLEARANCE_M
-        history.flung |= speed_mps > FLUNG_SPEED_MPS and all(name != cube for cube, _ in touched)
+        flung = speed_mps > FLUNG_SPEED_MPS and all(name != cube for cube, _ in touched)
         return TaskState(
-            clearance_m=clearance_m, peak_clearance_m=history.peak_clearance_m, speed_mps=speed_mps,
-            zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts), carried=history.carried,
-            flung=history.flung, hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))), cube_m=cube_m,
-            start_m=history.start_m, hand_m=hand_m, hand_zone_offset_m=self._from_zone(index, hand_m),
+            clearance_m=clearance_m, peak_clearance_m=max(before.peak_clearance_m, clearance_m), speed_mps=speed_mps,
+            zone_offset_m=self._from_zone(index, cube_m), held=held, touched=bool(parts),
+            carried=before.carried or (held and clearance_m > CARRY_CLEARANCE_M), flung=before.flung or flung,
+            hand_distance_m=float(np.linalg.norm(np.subtract(hand_m, cube_m))), cube_m=cube_m, start_m=before.start_m,
+            hand_m=hand_m, hand_zone_offset_m=self._from_zone(index, hand_m),
         )  # fmt: skip
 
     def _from_zone(self, index: int, point_m: tuple[float, float, float]) -> tuple[float, float]:
@@ -240,37 +229,14 @@ class So100Env(gymnasium.Env):
             observation["pixels"] = self.camera_images(self.cameras)
         return observation
 
-    def _info(self) -> dict[str, Any]:
-        return {"is_success": self._streak >= self._task.hold_steps}
-
-    def _draw(self, camera: str) -> np.ndarray:
-        owner = self._renderer_of or self
-        if owner._renderer is None:
-            owner._renderer = open_renderer(owner.model, owner.image_size)
-        return owner._renderer.draw(self.model, self.data, camera)
-
-    def _range(self) -> tuple[np.ndarray, np.ndarray]:
-        limits_rad = self.model.jnt_range[:NUM_JOINTS]
-        return from_radians(limits_rad[:, 0], limits_rad), from_radians(limits_rad[:, 1], limits_rad)
-
     def _observation_space(self) -> spaces.Dict:
-        low, high = self._range()
+        low, high = self.action_space.low, self.action_space.high
         margin = 10.0  # MuJoCo's joint limits are soft
         parts: dict[str, spaces.Space] = {"agent_pos": spaces.Box(low - margin, high + margin, dtype=np.float32)}
         if self.cameras:
             image = spaces.Box(0, 255, (self.image_size, self.image_size, 3), np.uint8)
             parts["pixels"] = spaces.Dict({camera: image for camera in self.cameras})
         return spaces.Dict(parts)
-
-
-@dataclass
-class _CubeHistory:
-    """What has happened to a cube so far in this episode."""
-
-    start_m: tuple[float, float, float]
-    peak_clearance_m: float = 0.0
-    carried: bool = False
-    flung: bool = False
 
 
 def to_radians(joints: np.ndarray, limits_rad: np.ndarray) -> np.ndarray:

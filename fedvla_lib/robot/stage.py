@@ -22,12 +22,10 @@ class Stage:
         return envs[:count]
 
     def close(self) -> None:
-        """Free the renderer."""
+        """Free the renderer and forget the environments; the stage can be used again."""
         for envs in self._envs.values():
             envs[0].close()
+        self._envs.clear()
 
 
-@cache
-def stage_of_process(image_size: int, jitter: float = 0.0) -> Stage:
-    """Return the stage of this process, for workers, which end with all that they opened."""
-    return Stage(image_size, jitter)
+stage_of_process = cache(Stage)  # the one of this process; a worker leaves it open, since it ends with all it opened

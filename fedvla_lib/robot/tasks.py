@@ -31,17 +31,17 @@ PULL_M = 0.025
 
 @dataclass(frozen=True)
 class TaskState:
-    """Input of the success predicates, measured after a control step, for one cube."""
+    """Input of the success predicates, measured after a control step, for one cube; by default before the first."""
 
-    clearance_m: float  # height of the cube's centre above its resting height on the table
-    peak_clearance_m: float  # the largest clearance so far in this episode
-    speed_mps: float  # speed of the cube's centre
-    zone_offset_m: tuple[float, float]  # cube centre minus its zone's centre, x and y; infinite without a zone
-    held: bool  # both jaws touch the cube
-    touched: bool  # any part of the arm touches the cube
-    carried: bool  # at some time in this episode both jaws held the cube clear of the table
-    flung: bool  # at some time in this episode the cube moved over the table with nothing touching it
-    hand_distance_m: float  # from the grasp point between the jaws to the cube's centre
+    clearance_m: float = 0.0  # height of the cube's centre above its resting height on the table
+    peak_clearance_m: float = 0.0  # the largest clearance so far in this episode
+    speed_mps: float = 0.0  # speed of the cube's centre
+    zone_offset_m: tuple[float, float] = (np.inf, np.inf)  # cube centre minus its zone's centre; infinite without zone
+    held: bool = False  # both jaws touch the cube
+    touched: bool = False  # any part of the arm touches the cube
+    carried: bool = False  # at some time in this episode both jaws held the cube clear of the table
+    flung: bool = False  # at some time in this episode the cube moved over the table with nothing touching it
+    hand_distance_m: float = np.inf  # from the grasp point between the jaws to the cube's centre
     cube_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the cube's centre
     start_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the cube's centre at the start of the episode
     hand_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the grasp point

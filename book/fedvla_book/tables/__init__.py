@@ -18,7 +18,7 @@ from fedvla_book.tables.grids import (
     repeat_partition_free,
     unpaired_difference,
 )
-from fedvla_book.tables.model import averaging_error, module_table
+from fedvla_book.tables.model import adapters, averaging_error, learning_rates, module_table
 from fedvla_book.tables.searches import SEARCHED, compared, read_searches
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "paired",
     "paired_difference",
     "SEARCHED",
+    "adapters",
     "at_own_task",
     "averaging_error",
     "beside_own_tasks",
@@ -37,6 +38,7 @@ __all__ = [
     "disagreements",
     "fill_in",
     "heterogeneity",
+    "learning_rates",
     "module_table",
     "read_rounds",
     "read_searches",

@@ -1,12 +1,16 @@
-"""Tables of the model: parameters of its parts, and the error of averaging LoRA adapters."""
+"""Tables of the model: parameters of its parts, learning rates, and the error of averaging LoRA adapters."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fedvla_lib.config import Config
+
 if TYPE_CHECKING:  # loads torch, which tables of stored results do without
     from lerobot.policies.smolvla import SmolVLAPolicy
+
+    from fedvla_lib.policy.model import Bundle
 
 MODULES = {
     "model.vlm_with_expert.vlm.model.vision_model": "vision encoder",
@@ -29,6 +33,21 @@ def module_table(policy: "SmolVLAPolicy") -> list[dict[str, Any]]:
         trained = sum(size for p, size in sizes.items() if p.requires_grad)
         rows.append({"module": prefix, "part": part, "parameters": sum(sizes.values()), "trainable": trained})
     return rows
+
+
+def learning_rates(bundle: "Bundle", config: Config, *, steps: int) -> list[float]:
+    """Return the learning rate of each of `steps` gradient steps."""
+    from fedvla_lib.policy.training import adamw  # loads torch
+
+    _, scheduler = adamw(bundle, config, 0, steps)
+    return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]
+
+
+def adapters(policy: "SmolVLAPolicy") -> dict[str, np.ndarray]:
+    """Return all A and B matrices of a policy by name, float32, including frozen ones."""
+    from fedvla_lib.policy.lora import A, B  # loads torch
+
+    return {name: p.detach().cpu().numpy().copy() for name, p in policy.named_parameters() if name.endswith((A, B))}
 
 
 def averaging_error(updates: Sequence[Mapping[str, np.ndarray]], weights: Sequence[float]) -> dict[str, float]:
