@@ -25,12 +25,14 @@ GRACE_S = 5.0  # to clean up, after its parent was killed
 TERMINATED = 143  # exit status after SIGTERM, as shells report it
 
 
-def default_jobs() -> int:
-    """Return ``$FEDVLA_JOBS``, or else one job for each core, as many as free memory allows."""
+def default_jobs(device: str = "cpu") -> int:
+    """Return ``$FEDVLA_JOBS``, or else one job for each core, as many as free memory allows; one on a GPU."""
     chosen = os.environ.get("FEDVLA_JOBS", "")
     if chosen and not (chosen.isdecimal() and int(chosen)):
         raise ValueError(f"FEDVLA_JOBS={chosen!r} is not usable: give a whole number from 1")
-    return int(chosen or max(1, min(granted_cores(), int(psutil.virtual_memory().available / 2**30 / GIB_A_JOB))))
+    if chosen or device != "cpu":  # processes would share the GPU
+        return int(chosen or 1)
+    return max(1, min(granted_cores(), int(psutil.virtual_memory().available / 2**30 / GIB_A_JOB)))
 
 
 def side_by_side(

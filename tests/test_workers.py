@@ -84,9 +84,10 @@ def test_workers_end_with_their_parent(tmp_path, sign):
 
 def test_the_number_of_jobs_is_set_by_the_environment_or_the_machine(monkeypatch):
     monkeypatch.setenv("FEDVLA_JOBS", "5")
-    assert workers.default_jobs() == 5
+    assert workers.default_jobs() == workers.default_jobs("cuda") == 5
     monkeypatch.delenv("FEDVLA_JOBS")
     assert 1 <= workers.default_jobs() <= workers.granted_cores()
+    assert workers.default_jobs("cuda") == 1
     for wrong in ("0", "two", "-1"):
         monkeypatch.setenv("FEDVLA_JOBS", wrong)
         with pytest.raises(ValueError, match=f"FEDVLA_JOBS='{wrong}' is not usable"):

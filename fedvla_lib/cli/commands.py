@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> None:
     config = _new_or_resumed(options)
     if options.engine == "simulation":
         return _print_rounds(simulation.run_simulation(config))
-    _print_rounds(inline.run_inline(config, jobs=_jobs(options)))
+    _print_rounds(inline.run_inline(config, jobs=_jobs(options, config.device)))
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:
@@ -196,15 +196,16 @@ def experiment(options: argparse.Namespace) -> None:
     from fedvla_lib.experiments.experiment_file import read_plan
     from fedvla_lib.experiments.results import read_results, summary
 
-    run_plan(read_plan(options.file), options.out, jobs=_jobs(options))
+    plan = read_plan(options.file)
+    run_plan(plan, options.out, jobs=_jobs(options, next((cell.config.device for cell in plan.cells), "cpu")))
     print(summary(read_results(options.out)).round(3).to_string(index=False))
 
 
-def _jobs(options: argparse.Namespace) -> int:
+def _jobs(options: argparse.Namespace, device: str) -> int:
     from fedvla_lib.workers import default_jobs
 
     if options.jobs is None:
-        return default_jobs()
+        return default_jobs(device)
     _require_positive("--jobs", options.jobs)
     return options.jobs
 
@@ -233,7 +234,7 @@ def evaluate(options: argparse.Namespace) -> None:
     chosen = _saved_settings(options.policy)
     actor = PolicyActor(load_policy(chosen), options.seed)
     seeds, videos = rollouts.rollout_seeds(options.rollouts), options.out and options.out / "videos"
-    settings_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options)}
+    settings_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options, chosen.device)}
     rows = rollouts.evaluate(actor, tasks, seeds, **settings_of)
     _print_success(rows, options.out and options.out / "rows.csv")
 

@@ -24,6 +24,7 @@ from fedvla_lib.files import cache_dir
 from fedvla_lib.policy import model, nano, prefix_cache
 from fedvla_lib.policy.training import TrainResult, local_train
 from fedvla_lib.provenance import code_digest
+from fedvla_lib.workers import default_jobs
 
 STEPS_FILE = "steps.json"  # next to a cached model's weights: its gradient steps as counted while training
 
@@ -50,7 +51,9 @@ def federated(config: Config, progress: bool = True) -> Path:
         for folder in sorted(out.glob("*/")):
             if run_folder.read_stamp(folder)["status"] == "completed":
                 return folder
-        return inline.run_inline(replace(config, out=str(out)), progress=progress)
+        return inline.run_inline(
+            replace(config, out=str(out)), progress=progress, jobs=default_jobs(config.device)
+        )
 
 
 def federated_policy(config: Config) -> model.Bundle:
