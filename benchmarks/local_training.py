@@ -19,15 +19,17 @@ from fedvla_lib.data.batches import Batches
 from fedvla_lib.data.episode_writer import REPO_ID
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.policy import model, prefix_cache
-from fedvla_lib.policy.training import _optimizer as make_optimizer
+from fedvla_lib.policy.training import adamw
 from fedvla_lib.robot.spec import ACTION_KEY, FPS
 from report import laptop, options, recording, report, start, timed
+
+WARM_UP = 5  # steps: memory is allocated, and workers start
 
 
 def main() -> None:
     """Measure and report."""
     parser = options(__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=30, help="gradient steps measured on each side")
+    parser.add_argument("--steps", type=int, default=40, help="gradient steps measured on each side")
     parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2], help="DataLoader workers to try")
     chosen = parser.parse_args()
     config = laptop(chosen.profile)
@@ -65,9 +67,9 @@ def main() -> None:
 def train(
     bundle: model.Bundle, config: Config, batches: Iterator[dict], steps: int, fused: bool | None = None
 ) -> tuple[list[float], float]:
-    """Train with the same noise on both sides; return losses and seconds, with the first (warm-up) step
-    counted as an average one."""
-    optimizer, scheduler = make_optimizer(bundle, config, 0, 1000)
+    """Train with the same noise on both sides; return losses and seconds, with the first steps (warm-up)
+    counted as average ones."""
+    optimizer, scheduler = adamw(bundle, config, 0, 1000)
     optimizer.param_groups[0]["fused"] = fused  # None: PyTorch's default, which LeRobot leaves as it is
     trainable = [p for p in bundle.policy.parameters() if p.requires_grad]
     bundle.policy.train()
@@ -76,7 +78,7 @@ def train(
         timed(lambda: losses.append(one_step(bundle, next(batches), trainable, (optimizer, scheduler), len(losses))))
         for _ in range(steps)
     ]
-    return losses, sum(seconds[1:]) * steps / (steps - 1)
+    return losses, sum(seconds[WARM_UP:]) * steps / (steps - WARM_UP)
 
 
 def one_step(bundle: model.Bundle, batch: dict, trainable: list, optimizer: tuple, step: int) -> float:

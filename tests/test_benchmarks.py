@@ -24,7 +24,7 @@ def run(name: str, out: Path, *arguments: str) -> list[dict]:
 
 
 def test_local_training_computes_what_lerobot_computes(tmp_path):
-    for row in run("local_training", tmp_path, "--steps", "3", "--workers", "0", "1"):
+    for row in run("local_training", tmp_path, "--steps", "7", "--workers", "0", "1"):
         assert row["largest loss difference"] <= 1e-6
         assert row["ours [samples/s]"] > 0 < row["lerobot [samples/s]"]
 

@@ -86,14 +86,6 @@ def test_cache_that_cannot_be_made(tmp_path):
     assert doctor.check_cache(tmp_path / "cache").ok
 
 
-def test_more_threads_than_cores_is_advice(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "64")
-    check = doctor.check_threads(cores=2)
-    assert not check.ok and not check.required and "OMP_NUM_THREADS=2" in check.fix
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    assert doctor.check_threads(cores=2).ok
-
-
 def test_memory_below_the_threshold_is_advice():
     check = doctor.check_memory(min_gib=1e6)
     assert not check.required and not check.ok

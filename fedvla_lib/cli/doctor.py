@@ -19,7 +19,6 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from fedvla_lib.config import granted_cores
 from fedvla_lib.files import cache_dir
 
 MIN_PYTHON = (3, 12)
@@ -176,16 +175,6 @@ def check_memory(min_gib: float = MIN_MEMORY_GIB) -> Check:
     return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", fix, required=False)
 
 
-def check_threads(cores: int | None = None) -> Check:
-    """Compare the thread counts set for numerical libraries with the cores granted to this process."""
-    cores = cores or granted_cores()
-    settings = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if name in os.environ}
-    over = [f"{name}={cores}" for name, value in settings.items() if value.isdigit() and int(value) > cores]
-    found = f"{cores} cores granted" + "".join(f", {name}={value}" for name, value in settings.items())
-    fix = f"export {' '.join(over)}: more threads than cores are far slower"
-    return Check("threads", not over, found, fix, required=False)
-
-
 def check_hub(timeout_s: float = HUB_TIMEOUT_S) -> Check:
     """Check whether the Hugging Face Hub answers; only the gpu profile and data sets on the hub need it."""
     is_off = os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}
@@ -207,7 +196,7 @@ def examine(folder: Path | None = None) -> list[Check]:
     folder = folder or cache_dir()
     lock = Path(__file__).parents[2] / "requirements.lock"
     checks = [check_interpreter(), check_packages(), check_lock(lock), check_rendering(), check_video()]
-    return [*checks, check_cache(folder), check_disk(folder), check_memory(), check_threads(), check_hub()]
+    return [*checks, check_cache(folder), check_disk(folder), check_memory(), check_hub()]
 
 
 def can_run(checks: Iterable[Check]) -> bool:

@@ -116,16 +116,15 @@ class _FeedForward(Function):
         normed, scale = _normed(x, eps)
         inward = torch.cat([gate, up])
         both = torch.mm(normed, (inward * gain).t())
-        active = functional.silu(both[:, : len(gate)])
-        inner = active * both[:, len(gate) :]
-        ctx.save_for_backward(normed, scale, gain, inward, down, both, active, inner)
+        inner = functional.silu(both[:, : len(gate)]).mul_(both[:, len(gate) :])
+        ctx.save_for_backward(normed, scale, gain, inward, down, both, inner)
         return torch.addmm(x, inner, down.t())
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple:
-        normed, scale, gain, inward, down, both, active, inner = ctx.saved_tensors
+        normed, scale, gain, inward, down, both, inner = ctx.saved_tensors
         of_inner, of_both, width = torch.mm(grad, down), torch.empty_like(both), inner.shape[1]
-        torch.mul(of_inner, active, out=of_both[:, width:])
+        torch.mul(of_inner, functional.silu(both[:, :width]), out=of_both[:, width:])
         of_active = of_inner.mul_(both[:, width:])
         torch.ops.aten.silu_backward.grad_input(of_active, both[:, :width], grad_input=of_both[:, :width])
         of_x, of_gain, of_inward = _linear_gradients(of_both, normed, scale, gain, inward)
