@@ -67,7 +67,7 @@ def test_every_setting_is_a_flag_and_unset_flags_leave_the_profile_alone():
         (["experts", "--episodes", "0"], "--episodes 0 is not usable: give 1 or more"),
         (["experts", "--task", "juggle"], "unknown task 'juggle'"),
         (["pretrain", "--out", "{tmp}"], "{tmp} exists already: give a folder that does not"),
-        (["pretrain", "--out", "{tmp}/new", "--steps", "0"], "steps=0 is not usable: give a number above 0"),
+        (["pretrain", "--out", "{tmp}/new", "--steps", "0"], "--steps 0 is not usable: give 1 or more"),
         (["evaluate", "{tmp}"], "{tmp} is not a pretrained_model folder: it has no config.json"),
         (["evaluate", "{tmp}", "--rollouts", "0"], "--rollouts 0 is not usable"),
         (["train", "--resume", "{tmp}/none"], "{tmp}/none"),

@@ -64,7 +64,6 @@ def experts(options: argparse.Namespace) -> None:
     from fedvla_lib.evaluation.rollouts import rollout_seeds
     from fedvla_lib.robot.expert import expert_success
 
-    _require_positive("--episodes", options.episodes)
     tasks = check_tasks(options.task or list(TASKS))
     _print_success([row for task in tasks for row in expert_success(task, rollout_seeds(options.episodes))])
 
@@ -79,8 +78,6 @@ def train(options: argparse.Namespace) -> None:
     """Train one policy, on all data or on one client's, into a run folder."""
     from fedvla_lib.run_folder import start
 
-    if options.steps is not None:
-        _require_positive("--steps", options.steps)
     chosen = _new_or_resumed(options)
     with start(chosen, engine="local") as folder:
         _train_into(folder, chosen, options)
@@ -172,7 +169,6 @@ def credentials(options: argparse.Namespace) -> None:
     """Write certificates of an authority and a server, and a key for each node; print who gets which file."""
     from fedvla_lib.engines.credentials import make_node_key, make_server
 
-    _require_positive("--nodes", options.nodes)
     if options.out.exists():
         raise ValueError(f"--out {options.out} exists: give a new folder, so that no key is overwritten")
     server = make_server(options.out / "server", options.host)
@@ -204,10 +200,7 @@ def experiment(options: argparse.Namespace) -> None:
 def _jobs(options: argparse.Namespace, device: str) -> int:
     from fedvla_lib.workers import default_jobs
 
-    if options.jobs is None:
-        return default_jobs(device)
-    _require_positive("--jobs", options.jobs)
-    return options.jobs
+    return options.jobs or default_jobs(device)
 
 
 def search(options: argparse.Namespace) -> None:
@@ -229,7 +222,6 @@ def evaluate(options: argparse.Namespace) -> None:
     from fedvla_lib.policy.actor import PolicyActor
     from fedvla_lib.policy.model import load_policy
 
-    _require_positive("--rollouts", options.rollouts)
     tasks = check_tasks(options.task or list(TASKS))
     chosen = _saved_settings(options.policy)
     actor = PolicyActor(load_policy(chosen), options.seed)
@@ -316,11 +308,6 @@ def _print_success(rows: list[dict[str, Any]], csv: Path | None = None) -> None:
     if csv:
         write_atomically(csv, table.to_csv(index=False).encode())
     _print_table(success_table(table, ["task"]))
-
-
-def _require_positive(flag: str, value: int) -> None:
-    if value < 1:
-        raise ValueError(f"{flag} {value} is not usable: give 1 or more")
 
 
 def _print_table(table: Any) -> None:

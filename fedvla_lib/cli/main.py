@@ -4,6 +4,7 @@ Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line tha
 `kill` and closing the terminal are handled as Ctrl-C.
 """
 
+import argparse
 import signal
 import sys
 import threading
@@ -15,6 +16,7 @@ from fedvla_lib.cli.commands import FAILED
 from fedvla_lib.cli.parser import build_parser
 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)  # the library raises these with a message for users
+COUNTS = ("episodes", "jobs", "nodes", "rollouts", "steps", "trials")  # flags with a number above zero
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 # From kill, and from a closing terminal.
 SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -24,6 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     options = build_parser().parse_args(argv)
     try:
+        _check_counts(options)
         with _signals_as_ctrl_c():
             return options.handler(options) or 0
     except KeyboardInterrupt:
@@ -35,6 +38,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         message = " ".join(str(error).split()) or type(error).__name__
         print(f"fedvla {options.command}: {message}", file=sys.stderr)
         return FAILED
+
+
+def _check_counts(options: argparse.Namespace) -> None:
+    for name in COUNTS:
+        if (value := getattr(options, name, None)) is not None and value < 1:
+            raise ValueError(f"--{name} {value} is not usable: give 1 or more")
 
 
 @contextmanager

@@ -51,9 +51,8 @@ def federated(config: Config, progress: bool = True) -> Path:
         for folder in sorted(out.glob("*/")):
             if run_folder.read_stamp(folder)["status"] == "completed":
                 return folder
-        return inline.run_inline(
-            replace(config, out=str(out)), progress=progress, jobs=default_jobs(config.device)
-        )
+        config = replace(config, out=str(out))
+        return inline.run_inline(config, progress=progress, jobs=default_jobs(config.device))
 
 
 def federated_policy(config: Config) -> model.Bundle:

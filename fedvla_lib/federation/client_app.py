@@ -41,7 +41,10 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
-        return Message(_introduction(_client(context, loaders)), reply_to=message)
+        client = _client(context, loaders)
+        known = {"partition_id": client.partition_id, "num_examples": client.num_examples}
+        note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()))
+        return Message(RecordDict({messages.NOTE: note}), reply_to=message)
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
@@ -56,12 +59,6 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
         return Message(_evaluated(client, bundle, message.content[messages.CONFIG][messages.ROUND]), reply_to=message)
 
     return app
-
-
-def _introduction(client: Client) -> RecordDict:
-    stats = normalisation.pack_stats(client.statistics())
-    note = messages.make_note(partition_id=client.partition_id, num_examples=client.num_examples, stats=stats)
-    return RecordDict({messages.NOTE: note})
 
 
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:

@@ -63,10 +63,13 @@ def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor,
     every = vlm.self_attn_every_n_layers
     for index, layer in enumerate(expert.layers):
         is_self = "cross" not in vlm.attention_mode or (every > 0 and index % every == 0)
-        block, shared = (_SelfAttention, to_self) if is_self else (_CrossAttention, to_prefix)
-        part, norm = layer.self_attn, layer.input_layernorm
-        weights = (each.weight for each in (norm, part.q_proj, part.k_proj, part.v_proj, part.o_proj))
-        hidden = block.apply(hidden, norm.variance_epsilon, stored[:, index], shared, *weights)
+        part, norm, prefix = layer.self_attn, layer.input_layernorm, stored[:, index].transpose(0, 1)
+        if is_self:
+            shared, inward = to_self, (part.q_proj, part.k_proj, part.v_proj)
+        else:
+            shared, inward, prefix = to_prefix, (part.q_proj,), _projected(prefix, part)
+        weights = (each.weight for each in (norm, *inward, part.o_proj))
+        hidden = _Attention.apply(hidden, norm.variance_epsilon, prefix, shared, *weights)
         mlp, norm = layer.mlp, layer.post_attention_layernorm
         weights = (each.weight for each in (norm, mlp.gate_proj, mlp.up_proj, mlp.down_proj))
         hidden = _FeedForward.apply(hidden, norm.variance_epsilon, *weights)
@@ -131,68 +134,49 @@ class _FeedForward(Function):
         return of_x.add_(grad), None, of_gain, *of_inward.chunk(2), torch.mm(grad.t(), inner)
 
 
-class _SelfAttention(Function):
-    """``x + O a`` where a attends to the constant keys and values of the prefix and to those of the chunk so far."""
+class _Attention(Function):
+    """``x + O a`` where a attends to a prefix and, if there are matrices for keys and values, to the chunk so far."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, eps: float, stored: Tensor, shared: _Shared, gain: Tensor, *weights: Tensor) -> Tensor:
-        count, _, groups, length, size = stored.shape
+    def forward(ctx, x: Tensor, eps: float, prefix: Tensor, shared: _Shared, gain: Tensor, *weights: Tensor) -> Tensor:
+        _, count, groups, length, size = prefix.shape
         *inward, out = weights
         normed, scale = _normed(x, eps)
         joint = torch.cat(inward)
         heads = torch.mm(normed, (joint * gain).t()).view(count, -1, len(joint) // size, size).transpose(1, 2)
-        queries, keys, values = heads.split([len(each) // size for each in inward], 1)
-        both = stored.new_empty(2, count, groups, length + keys.shape[2], size)
-        both[:, :, :, :length] = stored.transpose(0, 1)
-        _turn(keys, shared.cos, shared.sin, both[0, :, :, length:])
-        both[1, :, :, length:] = values
+        queries, *own = heads.split([len(each) // size for each in inward], 1)
+        both = prefix
+        if own:
+            both = prefix.new_empty(2, count, groups, length + own[0].shape[2], size)
+            both[..., :length, :] = prefix
+            _turn(own[0], shared.cos, shared.sin, both[0, :, :, length:])
+            both[1, :, :, length:] = own[1]
         asked, mixed, share = _attend(queries, *both, shared)
-        ctx.shared, ctx.shape, ctx.rows = shared, stored.shape, [len(each) for each in inward]
+        ctx.shared, ctx.rows, ctx.fixed = shared, [len(each) for each in inward], length if own else 0
         ctx.save_for_backward(normed, scale, gain, joint, out, asked, both, share, mixed)
         return torch.addmm(x, mixed, out.t())
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple:
         normed, scale, gain, joint, out, asked, both, share, mixed = ctx.saved_tensors
-        count, _, groups, length, size = ctx.shape
-        of_joint = grad.new_empty(count, mixed.shape[0] // count, len(joint) // size, size)
-        of_queries, of_keys, of_values = of_joint.transpose(1, 2).split([rows // size for rows in ctx.rows], 1)
-        of_own = _attention_gradients(torch.mm(grad, out), asked, both, share, ctx.shared, of_queries, length)
-        _turn(of_own[0], ctx.shared.cos, -ctx.shared.sin, of_keys)
-        of_values.copy_(of_own[1])
-        of_x, of_gain, of_inward = _linear_gradients(of_joint.view(len(grad), -1), normed, scale, gain, joint)
-        return of_x.add_(grad), None, None, None, of_gain, *of_inward.split(ctx.rows), torch.mm(grad.t(), mixed)
-
-
-class _CrossAttention(Function):
-    """``x + O a`` where a attends to the prefix, whose keys and values the layer projects once more."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, eps: float, stored: Tensor, shared: _Shared, gain: Tensor, *weights: Tensor) -> Tensor:
-        count, _, groups, length, size = stored.shape
-        of_queries, *inward, out = weights
-        normed, scale = _normed(x, eps)
-        queries = torch.mm(normed, (of_queries * gain).t()).view(count, -1, len(of_queries) // size, size)
-        flat = stored.permute(1, 0, 3, 2, 4).reshape(2, count * length, groups * size)
-        both = torch.stack([torch.mm(each, weight.t()) for each, weight in zip(flat, inward, strict=True)])
-        both = both.view(2, count, length, groups, size).transpose(2, 3).contiguous()
-        asked, mixed, share = _attend(queries.transpose(1, 2), *both, shared)
-        ctx.shared = shared
-        ctx.save_for_backward(normed, scale, gain, of_queries, out, asked, both, share, mixed, flat)
-        return torch.addmm(x, mixed, out.t())
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple:
-        normed, scale, gain, weight, out, asked, both, share, mixed, flat = ctx.saved_tensors
         count, size = both.shape[1], both.shape[-1]
-        of_rows = grad.new_empty(count, len(grad) // count, len(weight) // size, size)
-        of_both = _attention_gradients(torch.mm(grad, out), asked, both, share, ctx.shared, of_rows.transpose(1, 2))
-        of_inward = [
-            torch.mm(each.transpose(1, 2).reshape(rows.shape).t(), rows)
-            for each, rows in zip(of_both, flat, strict=True)
-        ]
-        of_x, of_gain, of_weight = _linear_gradients(of_rows.view(len(grad), -1), normed, scale, gain, weight)
-        return of_x.add_(grad), None, None, None, of_gain, of_weight, *of_inward, torch.mm(grad.t(), mixed)
+        of_joint = grad.new_empty(count, len(grad) // count, len(joint) // size, size)
+        of_queries, *of_own = of_joint.transpose(1, 2).split([rows // size for rows in ctx.rows], 1)
+        of_both = _attention_gradients(torch.mm(grad, out), asked, both, share, ctx.shared, of_queries, ctx.fixed)
+        if of_own:
+            _turn(of_both[0], ctx.shared.cos, -ctx.shared.sin, of_own[0])
+            of_own[1].copy_(of_both[1])
+        of_x, of_gain, of_inward = _linear_gradients(of_joint.view(len(grad), -1), normed, scale, gain, joint)
+        of_prefix = None if of_own else of_both
+        return of_x.add_(grad), None, of_prefix, None, of_gain, *of_inward.split(ctx.rows), torch.mm(grad.t(), mixed)
+
+
+def _projected(stored: Tensor, part: torch.nn.Module) -> Tensor:
+    """Keys and values of the prefix, projected once more: (2, B, groups, L, head dim), as are those stored."""
+    _, count, groups, length, size = stored.shape
+    flat = stored.transpose(2, 3).reshape(2, count * length, groups * size)
+    both = torch.bmm(flat, torch.stack([part.k_proj.weight, part.v_proj.weight]).transpose(1, 2))
+    return both.view(2, count, length, groups, size).transpose(2, 3).contiguous()
 
 
 def _normed(x: Tensor, eps: float) -> tuple[Tensor, Tensor]:
@@ -239,8 +223,8 @@ def _attend(queries: Tensor, keys: Tensor, values: Tensor, shared: _Shared) -> t
 
 
 def _attention_gradients(
-    grad: Tensor, asked: Tensor, both: Tensor, share: Tensor, shared: _Shared, of_queries: Tensor, fixed: int = 0
-) -> tuple[Tensor, Tensor]:
+    grad: Tensor, asked: Tensor, both: Tensor, share: Tensor, shared: _Shared, of_queries: Tensor, fixed: int
+) -> Tensor:
     """Write the gradient of the queries into `of_queries`; return those of keys and values after the first `fixed`."""
     count, heads, steps, size = of_queries.shape
     keys, values = both.flatten(1, 2)
@@ -248,6 +232,7 @@ def _attention_gradients(
     of_share = torch.bmm(rows, values.transpose(1, 2))
     of_score = torch._softmax_backward_data(of_share, share, -1, share.dtype).mul_(size**-0.5)
     _turn(torch.bmm(of_score, keys).view(of_queries.shape), shared.cos, -shared.sin, of_queries)
-    own = both.shape[1], both.shape[2], both.shape[3] - fixed, size
-    of_keys = torch.bmm(of_score[:, :, fixed:].transpose(1, 2), asked).view(own)
-    return of_keys, torch.bmm(share[:, :, fixed:].transpose(1, 2), rows).view(own)
+    own = grad.new_empty(2, len(asked), both.shape[3] - fixed, size)
+    torch.bmm(of_score[:, :, fixed:].transpose(1, 2), asked, out=own[0])
+    torch.bmm(share[:, :, fixed:].transpose(1, 2), rows, out=own[1])
+    return own.view(*both.shape[:3], -1, size)

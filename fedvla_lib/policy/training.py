@@ -26,8 +26,6 @@ from fedvla_lib.policy.parameters import Arrays, trainable
 from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
 
 Parameters = Mapping[str, torch.nn.Parameter]
-
-
 Correction = Callable[[Parameters], None]  # changes gradients in place, after the backward pass, before clipping
 WEIGHTS_FILE = "trainable.safetensors"
 LOSSES_FILE = "losses.json"
@@ -115,7 +113,8 @@ def local_train(
             if not np.isfinite(losses[-1]):
                 raise FloatingPointError(f"loss is {losses[-1]} at step {start.step + step}: lower lr={config.lr}")
             bar.set_postfix(loss=f"{losses[-1]:.3f}")
-            if checkpoints and _is_due(step + 1, steps, config.checkpoint_every):
+            due = config.checkpoint_every > 0 and (step + 1) % config.checkpoint_every == 0
+            if checkpoints and (due or step + 1 == steps):
                 _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoints.folder))
         bundle.policy.eval()
         after = {} if start.moments is None else _moments(bundle, optimizer)
@@ -189,10 +188,6 @@ def _seeded(seed: int, start_step: int) -> Iterator[None]:
         yield
     finally:
         set_rng_state(before)
-
-
-def _is_due(done: int, steps: int, every: int) -> bool:
-    return done == steps or (every > 0 and done % every == 0)
 
 
 def _checkpoint(bundle: Bundle, optimizer: Any, scheduler: Any, losses: list[float], folder: Path) -> None:

@@ -163,8 +163,10 @@ class Checked:
             try:
                 check(answered(by_node.get(node)))
             except ParameterError as error:
-                rejected.append(error.kind)
-                self._reject(server_round, self.roster.name(node), kind, error)
+                name, reason = self.roster.name(node), error.kind
+                rejected.append(reason)
+                logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, reason, error)
+                self.report(server_round, name, "rejected", {"to": kind, "reason": reason, "detail": str(error)})
             else:
                 valid.append(by_node[node])
                 values = by_node[node].content.metric_records[messages.METRICS]
@@ -176,10 +178,6 @@ class Checked:
             counted |= {"sent_bytes": self._sent_bytes, "received_bytes": received}
             self.report(server_round, GLOBAL, "replies", counted | counts)
         return valid
-
-    def _reject(self, server_round: int, name: str, kind: str, error: ParameterError) -> None:
-        logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, error.kind, error)
-        self.report(server_round, name, "rejected", {"to": kind, "reason": error.kind, "detail": str(error)})
 
     def _check_train(self, reply: Message) -> None:
         _check_metrics(reply, messages.TRAIN_METRICS)
