@@ -27,6 +27,7 @@ from execution import (
     record_data,
     toc_pages,
 )
+from fedvla_lib.config import from_profile
 from fedvla_lib.files import write_atomically
 from fedvla_lib.workers import default_jobs
 from status import REPORTS
@@ -150,7 +151,8 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"--jobs {options.jobs} is not usable: give a whole number from 1")
     try:
         whole = not (options.execute_only or options.only)
-        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs or default_jobs())
+        device = from_profile(options.profile).device
+        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs or default_jobs(device))
     except (ValueError, OSError) as error:
         print(f"the book was not built: {error}", file=sys.stderr)
         return 2

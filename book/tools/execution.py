@@ -6,6 +6,8 @@ which covers notebook, library, requirements.lock and profile. papermill execute
 
 import argparse
 import hashlib
+import json
+import math
 import os
 import re
 import subprocess
@@ -31,6 +33,7 @@ from fedvla_lib.workers import processes
 
 PACKAGES = ("fedvla_lib", "book/fedvla_book")  # what chapters import
 REFERENCE = re.compile(rb"\.\./book/reference/\w+")  # a folder of stored results in a chapter's code
+COSTS = "book/reference/costs"  # kept by keep_costs.py
 CELL_TIMEOUT_S = {"tiny": 300, "laptop": 1800, "gpu": None}
 
 
@@ -202,7 +205,7 @@ def execute_chapters(
     if not notebooks:
         raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
     chapters = {path: reuse(path, folder, library) for path in notebooks}
-    changed = [path for path in notebooks[::-1] if chapters[path] is None]  # the last take longest, so they start first
+    changed = [path for path in notebooks if chapters[path] is None]
     if changed:
         prepare(profile)
     place = {path: f"[{number}/{len(notebooks)}] {path.stem}" for number, path in enumerate(notebooks, start=1)}
@@ -210,13 +213,20 @@ def execute_chapters(
         if chapters[path]:
             print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     needed = {path: {path.with_stem(name) for name in _metadata(path).get("after", [])} for path in changed}
-    first = sorted(changed, key=lambda path: not any(path in others for others in needed.values()))
     work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs)
-    order = first if jobs > 1 else changed[::-1]
+    order = _longest_first(changed, needed, root / COSTS / f"{profile}.json") if jobs > 1 else changed
     for path, chapter in _one_after_another(work, order, jobs, needed):
         chapters[path] = chapter
         print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     return list(chapters.values())
+
+
+def _longest_first(notebooks: list[Path], needed: dict[Path, set[Path]], costs: Path) -> list[Path]:
+    """Return chapters that others wait for, then the rest, the longest first by their kept costs."""
+    kept = json.loads(costs.read_text(encoding="utf-8"))["chapters"] if costs.is_file() else {}
+    awaited = set().union(*needed.values())
+    seconds = {path: kept.get(path.stem, {}).get("seconds") or math.inf for path in notebooks}
+    return sorted(notebooks, key=lambda path: (path not in awaited, -seconds[path]))
 
 
 def _one_after_another(

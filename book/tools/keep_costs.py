@@ -14,7 +14,7 @@ from pathlib import Path
 
 import nbformat
 
-from execution import add_profile, executed_folder, notebooks_of
+from execution import COSTS, add_profile, executed_folder, notebooks_of
 from fedvla_book.chapter_cost import MEASURED
 from fedvla_lib.files import write_json
 
@@ -55,7 +55,7 @@ def keep(root: Path, profile: str) -> Path:
         raise ValueError(f"not executed at profile {profile}: {', '.join(missing)}; run make book first")
     date = time.strftime("%Y-%m-%d", time.gmtime(max(file.stat().st_mtime for file in files)))
     chapters = {file.stem: measured_in(file) for file in files}
-    target = root / "book" / "reference" / "costs" / f"{profile}.json"
+    target = root / COSTS / f"{profile}.json"
     write_json(target, {"cores": os.cpu_count(), "date": date, "chapters": chapters})
     return target
 
