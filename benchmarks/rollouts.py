@@ -35,7 +35,7 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--policy", type=Path, required=True, help="a saved policy")
     parser.add_argument("--task", default="lift", help="the task")
-    parser.add_argument("--rollouts", type=int, default=96, help="rollouts on each side")
+    parser.add_argument("--rollouts", type=int, default=288, help="rollouts on each side")
     parser.add_argument(
         "--batch", type=int, default=rollouts.AT_ONCE, help="environments that lerobot-eval runs at once"
     )

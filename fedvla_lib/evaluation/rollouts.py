@@ -21,6 +21,7 @@ from fedvla_lib.robot.stage import stage_of_process
 from fedvla_lib.workers import side_by_side
 
 AT_ONCE = 16  # rollouts that share one batch of policy inference
+WORTH_WORKERS = 8  # groups: fewer take less time than worker processes need to start
 FIRST_SEED = 1_000_000  # far from the seeds of recorded demonstrations
 
 
@@ -54,6 +55,7 @@ def evaluate(
     """
     work, found = partial(_group, actor, image_size=image_size, labs=tuple(labs), videos_dir=videos_dir), {}
     groups = [(task, tuple(seeds[i : i + AT_ONCE])) for task in tasks for i in range(0, len(seeds), AT_ONCE)]
+    jobs = jobs if len(groups) >= WORTH_WORKERS else 1
     bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
     with bar, closing(stage_of_process(image_size)):
         for group, rows in side_by_side(work, groups, jobs):
