@@ -76,14 +76,13 @@ def processes(jobs: int, preload: Sequence[str] = HEAVY) -> Iterator[Executor]:
     context = multiprocessing.get_context(method)
     if method == "forkserver":
         context.set_forkserver_preload(list(preload))
-    before = set(multiprocessing.active_children())
+    ended = context.Event()  # reaches a worker that is just starting too, unlike a signal
     with _one_thread():
-        pool = ProcessPoolExecutor(jobs, context, _begin, (os.getpid(),))
+        pool = ProcessPoolExecutor(jobs, context, _begin, (os.getpid(), ended))
         try:
             yield pool
         except BaseException:
-            for process in set(multiprocessing.active_children()) - before:
-                process.terminate()
+            ended.set()
             raise
         finally:
             pool.shutdown(cancel_futures=True)
@@ -100,17 +99,17 @@ def _one_thread() -> Iterator[None]:
         os.environ.pop("OMP_NUM_THREADS") if before is None else os.environ.update(OMP_NUM_THREADS=before)
 
 
-def _begin(parent: int) -> None:
+def _begin(parent: int, ended: Any) -> None:
     """Prepare a worker process: it leaves Ctrl-C to its parent, cleans up when told to end, and never outlives it."""
     os.environ["FEDVLA_JOBS"] = "1"  # commands that it runs start no processes of their own
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_with, args=(parent, ended), daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
-    while psutil.pid_exists(parent):
-        time.sleep(1.0)
+def _end_with(parent: int, ended: Any) -> None:
+    while not ended.wait(1.0) and psutil.pid_exists(parent):
+        continue
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(GRACE_S)
     os._exit(TERMINATED)  # it cleaned up, and waits for more work
