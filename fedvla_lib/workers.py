@@ -36,7 +36,7 @@ def default_jobs(device: str = "cpu") -> int:
 
 
 def side_by_side(
-    function: Callable[[Any], Any], items: Sequence[Any], jobs: int, preload: Sequence[str] = HEAVY
+    function: Callable[[Any], Any], items: Sequence[Any], jobs: int, preload: Sequence[str] = HEAVY, here: bool = False
 ) -> Iterator[tuple[Any, Any]]:
     """Yield (item, result) for each item, as they complete; with one job in this process, one after the other.
 
@@ -45,6 +45,7 @@ def side_by_side(
         items: the earlier ones start first.
         jobs: processes at most.
         preload: modules that the processes share, imported once.
+        here: this process is one of them, and works while the others start; for pieces that take equally long.
 
     Raises:
         Exception: what `function` raised, at once; pieces of work that still run are ended.
@@ -54,12 +55,15 @@ def side_by_side(
         return
     # Pickled here: PyTorch would put a policy's arrays into shared memory, which goes wrong between two forks.
     work, waiting, running = pickle.dumps(function), list(items), {}
-    with processes(min(jobs, len(items)), preload) as pool:
+    others = min(jobs, len(items)) - here
+    with processes(others, preload) as pool:
         while waiting or running:
-            while waiting and len(running) < jobs:  # no more: results that are not yet taken stay in memory
+            while waiting and len(running) < others:  # no more: results that are not yet taken stay in memory
                 item = waiting.pop(0)
                 running[pool.submit(_unpickled, work, item)] = item
-            for done in wait(running, return_when=FIRST_COMPLETED).done:
+            if here and waiting:
+                yield waiting[0], function(waiting.pop(0))
+            for done in wait(running, 0 if here and waiting else None, FIRST_COMPLETED).done:
                 yield running.pop(done), done.result()
 
 

@@ -37,6 +37,11 @@ def slow_if_even(number: int) -> int:
     return number
 
 
+def in_a_moment(number: int) -> int:
+    time.sleep(0.5)
+    return os.getpid()
+
+
 def shifted(weights: torch.Tensor, number: int) -> float:
     return float((weights + number).sum())
 
@@ -49,6 +54,12 @@ def test_every_item_has_its_result(jobs):
     processes = {result[1] for result in found.values()}
     assert (processes == {os.getpid()}) == (jobs == 1) and len(processes) == jobs
     assert jobs == 1 or {result[2:] for result in found.values()} == {(1, "1")}
+
+
+def test_this_process_works_while_the_others_start():
+    found = dict(workers.side_by_side(in_a_moment, list(range(10)), 2, preload=(), here=True))
+    assert sorted(found) == list(range(10)) and len(set(found.values())) == 2
+    assert found[1] == os.getpid() != found[0]  # the first goes to the other process
 
 
 def test_arrays_of_torch_reach_every_worker():

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from fedvla_lib.config import Config, task_names
 from fedvla_lib.evaluation.video import save_rollout
 from fedvla_lib.policy.actor import PolicyActor
-from fedvla_lib.policy.model import Bundle
+from fedvla_lib.policy.model import Bundle, uses_one_thread
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.rollout import Episode, act_in_turn, run_episodes
 from fedvla_lib.robot.spec import CAMERAS, Actor
@@ -31,16 +31,9 @@ def rollout_seeds(count: int, first: int = FIRST_SEED) -> list[int]:
 
 
 def evaluate(
-    actor: Actor,
-    tasks: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    image_size: int,
-    labs: Sequence[Lab] = (REFERENCE,),
-    videos_dir: Path | None = None,
-    progress: bool = True,
-    jobs: int = 1,
-) -> list[dict[str, Any]]:
+    actor: Actor, tasks: Sequence[str], seeds: Sequence[int], *, image_size: int, labs: Sequence[Lab] = (REFERENCE,),
+    videos_dir: Path | None = None, progress: bool = True, jobs: int = 1,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Run one rollout per task and seed, seed s in lab s mod len(labs), and return a row for each.
 
     Without a video, only the images that the actor observes are rendered, which is faster and gives the same result.
@@ -58,7 +51,7 @@ def evaluate(
     jobs = jobs if len(groups) >= WORTH_WORKERS else 1
     bar = tqdm(total=len(tasks) * len(seeds), desc="rollouts", disable=not progress)
     with bar, closing(stage_of_process(image_size)):
-        for group, rows in side_by_side(work, groups, jobs):
+        for group, rows in side_by_side(work, groups, jobs, here=uses_one_thread()):
             found[group] = rows
             bar.update(len(group[1]))
     return [row for group in groups for row in found[group]]

@@ -98,6 +98,11 @@ def use_threads(config: Config, policy: SmolVLAPolicy) -> None:
     torch.set_num_threads(config.num_threads or (1 if small else granted_cores()))
 
 
+def uses_one_thread() -> bool:
+    """Return whether torch computes on one thread in this process, as it does in worker processes."""
+    return torch.get_num_threads() == 1
+
+
 def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
     """The arrays of the parts that stay on a client.
 
