@@ -19,8 +19,8 @@ print(json.dumps([sys.argv[1:], os.getcwd(), os.environ["COLOUR"], os.getpid(), 
 if "wait" in sys.argv:
     import subprocess
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    print(child.pid, flush=True)
     signal.signal(signal.SIGTERM, lambda *_: (child.kill(), sys.exit(9)))
+    print(child.pid, flush=True)
     time.sleep(60)
 sys.exit(input())
 """

@@ -11,6 +11,7 @@ import psutil
 import pytest
 import torch
 
+from conftest import heed_interrupts
 from fedvla_lib import workers
 
 pytestmark = pytest.mark.integration
@@ -79,7 +80,8 @@ def test_an_error_is_raised_at_once_and_ends_the_others():
 def test_workers_end_with_their_parent(tmp_path, sign):
     script = tmp_path / "interrupted.py"
     script.write_text(INTERRUPTED)
-    parent = subprocess.Popen([sys.executable, script, tmp_path], stderr=subprocess.DEVNULL)
+    command = [sys.executable, script, tmp_path]
+    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL, preexec_fn=heed_interrupts)
     while len(list(tmp_path.glob("[01]"))) < 2 or not all(p.read_text() for p in tmp_path.glob("[01]")):
         assert parent.poll() is None
         time.sleep(0.05)
