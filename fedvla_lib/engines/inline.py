@@ -88,15 +88,9 @@ class InlineGrid(Grid):
     pool: Executor | None = None  # worker processes that handle messages in place of `app`
 
     def __init__(
-        self,
-        app: ClientApp,
-        num_clients: int,
-        run_config: UserConfig,
-        data: Sequence[Path] = (),
-        *,
-        progress: bool = False,
-        raise_errors: bool = False,
-    ) -> None:
+        self, app: ClientApp, num_clients: int, run_config: UserConfig, data: Sequence[Path] = (), *,
+        progress: bool = False, raise_errors: bool = False,
+    ) -> None:  # fmt: skip
         self._app, self._progress, self._raise_errors = app, progress, raise_errors
         self._run = Run.create_empty(RUN_ID)
         self._replies: dict[str, Message] = {}

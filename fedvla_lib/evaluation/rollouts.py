@@ -31,16 +31,9 @@ def rollout_seeds(count: int, first: int = FIRST_SEED) -> list[int]:
 
 
 def evaluate(
-    actor: Actor,
-    tasks: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    image_size: int,
-    labs: Sequence[Lab] = (REFERENCE,),
-    videos_dir: Path | None = None,
-    progress: bool = True,
-    jobs: int = 1,
-) -> list[dict[str, Any]]:
+    actor: Actor, tasks: Sequence[str], seeds: Sequence[int], *, image_size: int, labs: Sequence[Lab] = (REFERENCE,),
+    videos_dir: Path | None = None, progress: bool = True, jobs: int = 1,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Run one rollout per task and seed, seed s in lab s mod len(labs), and return a row for each.
 
     Without a video, only the images that the actor observes are rendered, which is faster and gives the same result.
