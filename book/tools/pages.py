@@ -28,7 +28,8 @@ RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
     "book/reference_runs.md": ["four_methods"],
     "book/speed.md": [
-        "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor",
+        "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor", "busy",
+        "start_up",
     ],
     "book/scale.md": ["scale"],
 }  # fmt: skip

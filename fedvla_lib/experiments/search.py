@@ -41,14 +41,16 @@ def search(config: Config, trials: int, rollouts: int, out: Path) -> dict[str, A
 
     Args:
         config: the settings to start from; their total of gradient steps is the budget of each trial.
-        trials: number of trials, at least one, including those of earlier calls with the same `out`.
+        trials: number of trials, including those of earlier calls with the same `out`.
         rollouts: rollouts per task for the winner and the given settings.
         out: folder for the journal of trials, which a later call resumes, and for ``search.json``.
 
     Raises:
-        ValueError: fewer than two validation episodes, `out` holds a search with other settings, or every
+        ValueError: fewer than one trial or two validation episodes, `out` holds a search with other settings, or every
             trial diverged.
     """
+    if trials < 1:
+        raise ValueError(f"trials={trials} is not usable: give a number above 0")
     given = replace(config, **QUIET, validate_every=10**6)
     config, out = with_recording(given), Path(out)
     if (count := len(splits.held_out_episodes(recordings.open_frames(config), config))) < 2:
