@@ -41,7 +41,7 @@ def main() -> None:
 
     ours = model.load_policy(config, stats)
     with tempfile.TemporaryDirectory() as fresh:  # without the cache of earlier runs
-        stored_s = timed(lambda: prefix_cache.ensure_prefixes(ours, store, Path(fresh), progress=False))
+        stored_s = timed(lambda: prefix_cache.ensure_prefixes(ours, store, folder=Path(fresh)))
     supply = prefix_cache.with_cached_prefixes(ours, batches)
     our_losses, our_s = train(ours, config, (supply.at(step) for step in range(chosen.steps)), chosen.steps, fused=True)
     samples = chosen.steps * config.batch_size

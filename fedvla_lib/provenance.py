@@ -109,8 +109,7 @@ def _commit() -> str | None:
     if shutil.which("git") is None:
         return None
     command = ["git", "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
-    described = subprocess.run(command, cwd=LIBRARY, capture_output=True, text=True)
-    return described.stdout.strip() or None
+    return subprocess.run(command, cwd=LIBRARY, capture_output=True, text=True).stdout.strip() or None
 
 
 def now() -> str:

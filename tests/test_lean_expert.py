@@ -62,6 +62,10 @@ def own(policy, stored, real, noisy, times):
     return policy.model.denoise_step(real, cache, noisy, times)[..., :6]
 
 
+def lean(policy, *arguments):
+    return lean_expert.velocity(policy, *arguments, width=6)
+
+
 def loss_and_gradients(compute, policy):
     arguments, target = inputs(policy)
     loss = (target - compute(policy, *arguments)).square().mean()
@@ -74,7 +78,7 @@ def test_loss_and_gradients_equal_the_policys_own(settings):
     policy = policy_of(**settings)
     assert lean_expert.refusal(policy) == ""
     expected, wanted = loss_and_gradients(own, policy)
-    actual, found = loss_and_gradients(lean_expert.velocity, policy)
+    actual, found = loss_and_gradients(lean, policy)
     assert actual == pytest.approx(expected, rel=1e-6) and found.keys() == wanted.keys()
     apart = torch.stack([(found[name] - wanted[name]).norm() for name in wanted]).norm()
     assert apart < 1e-6 * torch.stack([g.norm() for g in wanted.values()]).norm()
@@ -85,11 +89,11 @@ def test_loss_and_gradients_equal_the_policys_own(settings):
 def test_each_sample_depends_on_its_own_real_positions_only():
     policy = policy_of()
     (stored, real, noisy, times), _ = inputs(policy)
-    before = lean_expert.velocity(policy, stored, real, noisy, times)
+    before = lean(policy, stored, real, noisy, times)
     stored[1, ..., 9:12, :] += 100  # padding
-    torch.testing.assert_close(lean_expert.velocity(policy, stored, real, noisy, times), before)
+    torch.testing.assert_close(lean(policy, stored, real, noisy, times), before)
     stored[1, ..., 3, :] += 1
-    changed = (lean_expert.velocity(policy, stored, real, noisy, times) != before).flatten(1).any(1)
+    changed = (lean(policy, stored, real, noisy, times) != before).flatten(1).any(1)
     assert changed.tolist() == [False, True, False, False, False]
 
 
@@ -106,7 +110,7 @@ def test_other_policies_are_refused_and_train_as_before():
 
 def test_fewer_numbers_are_multiplied_than_in_the_policys_own_pass():
     policy, counted = policy_of(), []
-    for compute in (own, lean_expert.velocity):
+    for compute in (own, lean):
         with FlopCounterMode(display=False) as counter:
             loss_and_gradients(compute, policy)
         counted.append(counter.get_total_flops())

@@ -30,7 +30,8 @@ def setup(recording):
 
 
 def chunk(bundle, batch):
-    return actor.predict_chunk(bundle, batch, torch.Generator().manual_seed(0))
+    noise = actor.starting_noise(bundle, len(batch["task"]), torch.Generator().manual_seed(0))
+    return bundle.postprocess(bundle.policy.predict_action_chunk(bundle.preprocess(dict(batch)), noise=noise))
 
 
 def test_at_first_adapters_change_nothing_and_they_alone_train(setup):

@@ -9,9 +9,11 @@ import torch
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation
 from fedvla_lib.data.batches import Batches
+from fedvla_lib.evaluation import held_out
 from fedvla_lib.policy import model, prefix_cache, training
+from fedvla_lib.policy.actor import starting_noise
 from fedvla_lib.policy.parameters import trainable
-from fedvla_lib.robot.spec import CAMERAS, STATE_KEY, image_key
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
 CONFIG = from_profile("tiny", base="nano-random", num_threads=1)
 
@@ -71,15 +73,37 @@ def test_nothing_is_stored_where_the_prefix_changes(store):
 
 @pytest.mark.unit
 def test_another_model_or_normalisation_gets_prefixes_of_its_own(store, tmp_path):
-    first = prefix_cache.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
-    again = prefix_cache.ensure_prefixes(fresh(store), store, tmp_path, progress=False)
+    first = prefix_cache.ensure_prefixes(fresh(store), store, folder=tmp_path)
+    again = prefix_cache.ensure_prefixes(fresh(store), store, folder=tmp_path)
     np.testing.assert_array_equal(first.cache, again.cache)
     assert len(list(tmp_path.iterdir())) == 1
-    prefix_cache.ensure_prefixes(fresh(store, replace(CONFIG, seed=1)), store, tmp_path, progress=False)
+    prefix_cache.ensure_prefixes(fresh(store, replace(CONFIG, seed=1)), store, folder=tmp_path)
     stats = normalisation.episode_stats(store, store.episodes.episode_id)
     stats[STATE_KEY]["mean"] = stats[STATE_KEY]["mean"] + 1
-    prefix_cache.ensure_prefixes(model.load_policy(CONFIG, stats), store, tmp_path, progress=False)
+    prefix_cache.ensure_prefixes(model.load_policy(CONFIG, stats), store, folder=tmp_path)
     assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("settings", [{}, {"train_expert_only": False}, {"lora_rank": 2}], ids=str)
+def test_held_out_frames_are_measured_as_the_policys_own_methods_would(store, settings):
+    """From stored prefixes where they are constant; in any order of episodes."""
+    config = replace(CONFIG, **settings)
+    bundle, ids = fresh(store, config), list(store.episodes.episode_id)[::-1]
+    batches = held_out.held_out_batches(store, ids, config, bundle)
+    assert (prefix_cache.PREFIX_KEY in batches[0]) == prefix_cache.is_constant(bundle.policy)
+    measured = held_out.measure_frames(bundle, batches, tolerance=5.0, seed=3)
+    rng, losses, errors = torch.Generator().manual_seed(3), [], []
+    for batch in held_out.held_out_batches(store, ids, config):
+        noise, size = starting_noise(bundle, len(batch["task"]), rng), len(batch["task"])
+        times, inputs = (torch.randperm(size, generator=rng) + 0.5) / size, bundle.preprocess(dict(batch))
+        losses.append(bundle.policy.forward(inputs, noise=noise, time=times, reduction="none")[0].detach())
+        chunks = bundle.policy.predict_action_chunk(inputs, noise=starting_noise(bundle, size, rng))
+        valid = ~batch["action_is_pad"][..., None]
+        wrong = (bundle.postprocess(chunks) - batch[ACTION_KEY]).abs() * valid
+        errors.append(wrong.sum((1, 2)) / (6 * valid.sum((1, 2))))
+    np.testing.assert_allclose(measured["loss"], torch.cat(losses), rtol=1e-5)
+    np.testing.assert_allclose(measured["action_error"], torch.cat(errors), rtol=1e-4)
 
 
 @pytest.mark.unit

@@ -42,8 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _flag(name: str, text: str, metavar: str | None = None, **options: Any) -> Flag:
-    typed = {"metavar": metavar, "type": TYPES.get(metavar)} if metavar else {}
-    return name, {"help": text, **typed, **options}
+    return name, {"help": text} | ({"metavar": metavar, "type": TYPES.get(metavar)} if metavar else {}) | options
 
 
 def _task(default: str) -> Flag:

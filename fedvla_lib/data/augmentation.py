@@ -35,5 +35,4 @@ def _shift(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def to_float(images: np.ndarray) -> torch.Tensor:
     """uint8 (B, H, W, 3) -> float32 (B, 3, H, W) in [0, 1]."""
-    channels_first = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
-    return channels_first.to(torch.float32).div_(255.0)
+    return torch.from_numpy(images).permute(0, 3, 1, 2).contiguous().to(torch.float32).div_(255.0)

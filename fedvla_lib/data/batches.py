@@ -5,7 +5,7 @@ A sample is the observation at one frame and the chunk of actions that starts th
 the loss can mask it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -41,6 +41,7 @@ class Batches:
     batch_size: int  # samples per batch
     seed: int  # of order and augmentation
     augment: bool = False
+    supply: Callable[[FrameStore, np.ndarray, int], dict[str, Any]] | None = None  # in place of `batch_of_rows`
 
     @cached_property
     def rows(self) -> np.ndarray:
@@ -57,6 +58,8 @@ class Batches:
 
         Every epoch visits each frame once, in a new random order; a batch may span two epochs.
         """
+        if self.supply:
+            return self.supply(self.store, self.rows_at(step), self.chunk_size)
         rng = np.random.default_rng([self.seed, AUGMENT_STREAM, step]) if self.augment else None
         return batch_of_rows(self.store, self.rows_at(step), self.chunk_size, rng)
 

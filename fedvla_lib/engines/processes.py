@@ -85,8 +85,7 @@ def reason(log: Path) -> str:
     """Return the first exception in a log, which caused any later ones, and the end of the log."""
     text = log.read_text(errors="replace")
     first = FIRST_ERROR.search(text)
-    cause = f"it began with {one_line(first[1])}; " if first else ""
-    return f"{cause}its log ends: {one_line(text)}"
+    return (f"it began with {one_line(first[1])}; " if first else "") + f"its log ends: {one_line(text)}"
 
 
 def one_line(text: str) -> str:

@@ -9,8 +9,10 @@ import torch
 from fedvla_lib.config import Config
 from fedvla_lib.data.batches import batch_of_rows
 from fedvla_lib.data.frame_store import FrameStore
-from fedvla_lib.policy.actor import predict_chunk
+from fedvla_lib.policy import prefix_cache
+from fedvla_lib.policy.actor import starting_noise
 from fedvla_lib.policy.model import Bundle
+from fedvla_lib.policy.prefix_cache import PREFIX_KEY
 from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES
 
 VALIDATION_STRIDE = 5  # frames, half a second: neighbouring frames are nearly the same
@@ -43,13 +45,16 @@ def average(frames: dict[str, np.ndarray]) -> dict[str, float]:
     return {name: float(np.average(each, weights=weights)) for name, each in frames.items() if name != "num_actions"}
 
 
+@torch.no_grad()
 def _measure(
     bundle: Bundle, batch: dict[str, Any], generator: torch.Generator, tolerance: float
 ) -> dict[str, np.ndarray]:
+    if PREFIX_KEY not in batch:
+        batch = batch | {PREFIX_KEY: prefix_cache.prefill(bundle, batch)}
     valid = ~batch["action_is_pad"].numpy()  # (B, chunk)
-    loss = _fixed_loss(bundle, batch, generator)
-    error = (predict_chunk(bundle, batch, generator) - batch[ACTION_KEY]).abs().double().numpy()  # (B, chunk, 6)
-    num_actions = valid.sum(axis=1)
+    num_actions, loss = valid.sum(axis=1), _fixed_loss(bundle, batch, generator)
+    predicted = prefix_cache.denoise(bundle, batch[PREFIX_KEY], starting_noise(bundle, len(valid), generator))
+    error = (predicted - batch[ACTION_KEY]).abs().double().numpy()  # (B, chunk, 6)
     by_joint = (error * valid[..., None]).sum(axis=1) / num_actions[:, None]
     accuracy = ((error <= tolerance) & valid[..., None]).sum(axis=(1, 2)) / (num_actions * error.shape[-1])
     joints = {f"action_error.{name}": by_joint[:, i] for i, name in enumerate(JOINT_NAMES)}
@@ -60,17 +65,12 @@ def _measure(
 
 
 def _fixed_loss(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> np.ndarray:
-    """Flow-matching loss of each frame, (B,), with noise ~ N(0, 1), time spread evenly over (0, 1) and
-    x_t = t noise + (1 - t) action.
-    """
-    settings, size = bundle.policy.config, len(batch["task"])
-    noise = torch.randn((size, settings.chunk_size, settings.max_action_dim), generator=generator)
+    """Flow-matching loss of each frame, (B,), with noise ~ N(0, 1) and time spread evenly over (0, 1)."""
+    size = len(batch["task"])
+    noise = starting_noise(bundle, size, generator)
     times = (torch.randperm(size, generator=generator) + 0.5) / size
-    inputs = bundle.preprocess(dict(batch))
-    noise, times = noise.to(settings.device), times.to(settings.device)
-    with torch.no_grad():
-        loss, _ = bundle.policy.forward(inputs, noise=noise, time=times, reduction="none")
-    return loss.double().cpu().numpy()
+    squared = prefix_cache.squared_errors(bundle, batch, noise, times.to(noise.device))  # (B, chunk, 6)
+    return squared.sum((1, 2)).double().cpu().numpy() / (squared.shape[-1] * (~batch["action_is_pad"]).sum(1).numpy())
 
 
 def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Sequence[int]) -> list[dict[str, float]]:
@@ -83,11 +83,18 @@ def by_episode(frames: dict[str, np.ndarray], store: FrameStore, episode_ids: Se
     ]
 
 
-def held_out_batches(store: FrameStore, episode_ids: Sequence[int], config: Config) -> list[dict[str, Any]]:
-    """Return raw batches of every fifth frame of the given episodes, without augmentation."""
-    rows = [row for episode in _measured_rows(store, episode_ids) for row in episode]
-    cuts = range(0, len(rows), VALIDATION_BATCH)
-    return [batch_of_rows(store, rows[i : i + VALIDATION_BATCH], config.chunk_size) for i in cuts]
+def held_out_batches(
+    store: FrameStore, episode_ids: Sequence[int], config: Config, bundle: Bundle | None = None
+) -> list[dict[str, Any]]:
+    """Return raw batches of every fifth frame of the given episodes, without augmentation.
+
+    For a policy whose training uses stored prefixes, they have those in place of images.
+    """
+    rows = np.array([row for episode in _measured_rows(store, episode_ids) for row in episode])
+    cuts, supply = range(0, len(rows), VALIDATION_BATCH), batch_of_rows
+    if bundle and len(rows) and prefix_cache.is_constant(bundle.policy):
+        supply = prefix_cache.ensure_prefixes(bundle, store, np.sort(rows)).batch
+    return [supply(store, rows[i : i + VALIDATION_BATCH], config.chunk_size) for i in cuts]
 
 
 def _measured_rows(store: FrameStore, episode_ids: Sequence[int]) -> list[range]:

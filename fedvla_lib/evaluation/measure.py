@@ -53,7 +53,7 @@ def measure(
     """
     ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
     episodes, averages = [], {}
-    if batches := held_out_batches(store, ids, config):
+    if batches := held_out_batches(store, ids, config, bundle):
         frames = measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
         episodes, averages = by_episode(frames, store, ids), average(frames)
     rows = roll_out(bundle, config, seeds, videos_dir, progress, jobs) if len(seeds) else []
@@ -81,5 +81,4 @@ def is_validated(config: Config, round_number: int) -> bool:
 
 def rolls_out(config: Config, round_number: int) -> bool:
     """Whether a round ends with closed-loop rollouts: every `eval_every` rounds, and the last."""
-    due = config.eval_every > 0 and round_number % config.eval_every == 0
-    return due or round_number == config.num_server_rounds
+    return (config.eval_every > 0 and round_number % config.eval_every == 0) or round_number == config.num_server_rounds

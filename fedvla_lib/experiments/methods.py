@@ -63,8 +63,7 @@ def federated_policy(config: Config) -> model.Bundle:
 
 def base(config: Config) -> model.Bundle:
     """Return the model that every method starts from, with the statistics of the pooled training episodes."""
-    pooled = normalisation.common_statistics(config, open_pooled(config).statistics())
-    return model.load_policy(config, pooled)
+    return model.load_policy(config, normalisation.common_statistics(config, open_pooled(config).statistics()))
 
 
 def centralized(config: Config, progress: bool = True) -> model.Bundle:

@@ -99,8 +99,8 @@ def suggest(trial: Any, config: Config) -> Config:
     if config.strategy == "fedprox":
         settings["proximal_mu"] = trial.suggest_float("proximal_mu", 1e-3, 10.0, log=True)
     steps_per_round = local_steps * sample_size(share, config.num_clients)
-    rounds = max(1, methods.total_steps(config) // steps_per_round)
-    return check(replace(config, **settings, num_server_rounds=rounds))
+    settings["num_server_rounds"] = max(1, methods.total_steps(config) // steps_per_round)
+    return check(replace(config, **settings))
 
 
 def report(config: Config, rollouts: int) -> dict[str, Any]:

@@ -40,25 +40,20 @@ class PolicyActor:
         if due:
             bundle = due[0][0].bundle
             batch = _as_batch([observed for _, observed in due], [actor._instruction for actor, _ in due])
-            noise = torch.cat([_noise(bundle, 1, actor._generator) for actor, _ in due])
+            noise = torch.cat([starting_noise(bundle, 1, actor._generator) for actor, _ in due])
             for (actor, _), chunk in zip(due, _denoise(bundle, batch, noise), strict=True):
                 actor._queue.extend(chunk[: bundle.policy.config.n_action_steps].numpy())
         return [actor._queue.popleft() for actor in actors]
 
 
-def predict_chunk(bundle: Bundle, batch: dict[str, Any], generator: torch.Generator) -> torch.Tensor:
-    """Denoise action chunks for a raw batch: float32 (B, chunk_size, 6) on the CPU, in degrees and gripper 0-100."""
-    return _denoise(bundle, batch, _noise(bundle, len(batch["task"]), generator))
-
-
-def _noise(bundle: Bundle, count: int, generator: torch.Generator) -> torch.Tensor:
+def starting_noise(bundle: Bundle, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Return the noise that `count` chunks are denoised from, on the policy's device: (B, chunk, max_action_dim)."""
     config = bundle.policy.config
-    return torch.randn((count, config.chunk_size, config.max_action_dim), generator=generator)
+    return torch.randn((count, config.chunk_size, config.max_action_dim), generator=generator).to(config.device)
 
 
 def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torch.Tensor:
     inputs = {key: value for key, value in batch.items() if key not in (ACTION_KEY, "action_is_pad")}
-    noise = noise.to(bundle.policy.config.device)
     chunk = bundle.policy.predict_action_chunk(bundle.preprocess(inputs), noise=noise)  # (B, chunk, 6) normalised
     return bundle.postprocess(chunk)
 

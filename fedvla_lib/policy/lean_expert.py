@@ -44,20 +44,20 @@ def refusal(policy: SmolVLAPolicy) -> str:
     return "" if kinds == {torch.float32} else f"parameters in {', '.join(sorted(map(str, kinds)))}"
 
 
-def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor, times: Tensor) -> Tensor:
+def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor, times: Tensor, width: int) -> Tensor:
     """Return the flow's velocity at noisy action chunks, as `SmolVLAPolicy.model.denoise_step` does.
 
     Args:
         stored: keys and values of the prefixes, float32 (B, layers, 2, kv heads, L, head dim).
         real: bool (B, L), False where the instruction is padded.
         noisy: float32 (B, chunk, max_action_dim).
-        times: float32 (B,), in (0, 1).
+        times: float32 (B,), in (0, 1].
+        width: action dimensions wanted, the first of max_action_dim.
 
     Returns:
-        float32 (B, chunk, action dim): the dimensions of real actions only.
+        float32 (B, chunk, width).
     """
-    model, width = policy.model, policy.config.action_feature.shape[0]
-    vlm, expert = model.vlm_with_expert, model.vlm_with_expert.lm_expert
+    model, vlm, expert = policy.model, policy.model.vlm_with_expert, policy.model.vlm_with_expert.lm_expert
     to_self, to_prefix = _tables(real, noisy.shape[1], stored.shape[3], vlm.num_attention_heads, stored.shape[-1])
     hidden = _embedded(policy, noisy, times).flatten(0, 1)  # (B * chunk, expert width)
     every = vlm.self_attn_every_n_layers

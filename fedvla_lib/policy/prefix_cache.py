@@ -7,12 +7,13 @@ its gradients equal those of `SmolVLAPolicy.forward`.
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from lerobot.policies.common.flow_matching import euler_integrate
 from lerobot.policies.common.vla_utils import make_att_2d_masks
 from lerobot.policies.smolvla import SmolVLAPolicy
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
@@ -33,35 +34,24 @@ BATCH = 64  # frames per forward pass while filling the store
 
 @dataclass(frozen=True)
 class PrefixStore:
-    """Keys and values of all frames of a data set under one frozen model."""
+    """Keys and values of frames of a data set under one frozen model."""
 
+    of: np.ndarray  # the N frames: rows of the data set, ascending
     cache: np.ndarray  # float32 (N, layers, 2, kv heads, prefix length, head dim): keys, then values
     real: np.ndarray  # bool (N, prefix length): False where the instruction is padded
 
-    def rows(self, rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return keys and values, and the mask, of frames `rows`."""
-        return torch.from_numpy(self.cache[rows]), torch.from_numpy(self.real[rows])
+    def batch(self, store: FrameStore, rows: np.ndarray, chunk_size: int) -> dict[str, Any]:
+        """Return the batch of these rows with prefixes, keys and values and their mask, in place of images."""
+        stored = np.searchsorted(self.of, rows)
+        prefixes = torch.from_numpy(self.cache[stored]), torch.from_numpy(self.real[stored])
+        return targets_of_rows(store, rows, chunk_size) | {PREFIX_KEY: prefixes}
 
 
-class PrefixBatches:
-    """The same training batches with stored prefixes in place of images."""
-
-    def __init__(self, batches: Batches, prefixes: PrefixStore) -> None:
-        self._batches, self._prefixes = batches, prefixes
-        self.seed, self.num_examples = batches.seed, batches.num_examples
-
-    def at(self, step: int) -> dict[str, Any]:
-        """Return the batch of a gradient step: targets in degrees, padding mask, task and prefix."""
-        rows = self._batches.rows_at(step)
-        targets = targets_of_rows(self._batches.store, rows, self._batches.chunk_size)
-        return targets | {PREFIX_KEY: self._prefixes.rows(rows)}
-
-
-def with_cached_prefixes(bundle: Bundle, batches: Batches, progress: bool = False) -> Batches | PrefixBatches:
+def with_cached_prefixes(bundle: Bundle, batches: Batches, progress: bool = False) -> Batches:
     """Return the same training batches with stored prefixes if prefixes are constant, else `batches` itself."""
     if batches.augment or not is_constant(bundle.policy):
         return batches
-    return PrefixBatches(batches, ensure_prefixes(bundle, batches.store, cache_dir() / "prefixes", progress))
+    return replace(batches, supply=ensure_prefixes(bundle, batches.store, progress=progress).batch)
 
 
 def is_constant(policy: SmolVLAPolicy) -> bool:
@@ -71,45 +61,68 @@ def is_constant(policy: SmolVLAPolicy) -> bool:
 
 
 def prefix_loss(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
-    """Return the flow-matching loss of a batch with stored prefix: mean of (v - (noise - action))^2 over real actions.
+    """Return the flow-matching loss of a batch with stored prefix: mean of `squared_errors` over real actions."""
+    squared = squared_errors(bundle, batch, noise, times)
+    return squared.sum() / ((~batch["action_is_pad"]).sum() * squared.shape[-1]).clamp_min(1)
+
+
+def squared_errors(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+    """Return (v - (noise - action))^2 for a batch with stored prefix, (B, chunk, 6), 0 where the action is padded.
 
     Args:
         noise: float32 (B, chunk, max_action_dim), x_1 of the flow.
         times: float32 (B,), t in (0, 1); the expert sees x_t = t noise + (1 - t) action.
     """
     policy, width = bundle.policy, bundle.policy.config.action_feature.shape[0]
-    stored, real = (part.to(noise.device) for part in batch[PREFIX_KEY])
     actions = policy.prepare_action({ACTION_KEY: bundle.normalise_actions(batch[ACTION_KEY])})  # padded like the noise
     mixed = times[:, None, None] * noise + (1 - times[:, None, None]) * actions
-    if bundle.is_lean:
-        velocity = lean_expert.velocity(policy, stored, real, mixed, times)
-    else:
-        velocity = policy.model.denoise_step(real, _as_cache(stored), mixed, times)[..., :width]
-    squared = ((noise - actions)[..., :width] - velocity).square()
-    valid = ~batch["action_is_pad"].to(noise.device)
-    return (squared * valid[..., None]).sum() / (valid.sum() * width).clamp_min(1)
-
-
-def ensure_prefixes(bundle: Bundle, store: FrameStore, folder: Path, progress: bool = True) -> PrefixStore:
-    """Return the prefixes of all frames of `store` under this model, computing them into `folder` if needed."""
-    target = folder / _fingerprint(bundle, store)
-    if not target.is_dir():
-        _fill(bundle, store, target, progress)
-    return PrefixStore(np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
+    squared = ((noise - actions)[..., :width] - _velocity(bundle, batch[PREFIX_KEY], mixed, times, width)).square()
+    return squared * ~batch["action_is_pad"].to(noise.device)[..., None]
 
 
 @torch.no_grad()
-def _fill(bundle: Bundle, store: FrameStore, target: Path, progress: bool) -> None:
-    count, length, cache = len(store.states), _longest(bundle, store), None
-    real = []
+def denoise(bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
+    """Return the action chunks that the policy makes of noise, as `predict_action_chunk`: (B, chunk, 6) in degrees."""
+    config, whole = bundle.policy.config, noise.shape[-1]
+    chunk = euler_integrate(lambda x, t: _velocity(bundle, prefix, x, t, whole), noise, config.num_steps)
+    return bundle.postprocess(chunk[..., : config.action_feature.shape[0]])
+
+
+def _velocity(
+    bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noisy: torch.Tensor, times: torch.Tensor, width: int
+) -> torch.Tensor:
+    stored, real = (part.to(noisy.device) for part in prefix)
+    if bundle.is_lean:
+        return lean_expert.velocity(bundle.policy, stored, real, noisy, times, width)
+    cache = DynamicCache([each.unbind(1) for each in stored.unbind(1)])
+    return bundle.policy.model.denoise_step(real, cache, noisy, times)[..., :width]
+
+
+def ensure_prefixes(
+    bundle: Bundle, store: FrameStore, rows: np.ndarray | None = None, *, folder: Path | None = None,
+    progress: bool = False,
+) -> PrefixStore:  # fmt: skip
+    """Return the prefixes of `rows`, by default all, under this model, computing them into `folder` if needed."""
+    rows = np.arange(len(store.states)) if rows is None else rows
+    target = (folder or cache_dir() / "prefixes") / _fingerprint(bundle, store, rows)
+    if not target.is_dir():
+        _fill(bundle, store, rows, target, progress)
+    return PrefixStore(rows, np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
+
+
+@torch.no_grad()
+def _fill(bundle: Bundle, store: FrameStore, rows: np.ndarray, target: Path, progress: bool) -> None:
+    cache, real, chunk_size = None, [], bundle.policy.config.chunk_size
+    instructions = batch_of_rows(store, store.episodes.drop_duplicates("instruction").start, chunk_size)
+    length = bundle.preprocess(instructions)[OBS_LANGUAGE_TOKENS].shape[1]  # of the longest one
     with new_folder(target) as draft:
-        for start in tqdm(range(0, count, BATCH), desc="frozen prefixes", disable=not progress):
-            rows = np.arange(start, min(start + BATCH, count))
-            stored, mask = prefill(bundle, batch_of_rows(store, rows, bundle.policy.config.chunk_size), length)
+        for start in tqdm(range(0, len(rows), BATCH), desc="frozen prefixes", disable=not progress):
+            batch = batch_of_rows(store, rows[start : start + BATCH], chunk_size)
+            stored, mask = prefill(bundle, batch, length)
             if cache is None:
-                file, shape = draft / "cache.npy", (count, *stored.shape[1:])
+                file, shape = draft / "cache.npy", (len(rows), *stored.shape[1:])
                 cache = np.lib.format.open_memmap(file, mode="w+", dtype=np.float32, shape=shape)
-            cache[rows] = stored.cpu().numpy()
+            cache[start : start + len(stored)] = stored.cpu().numpy()
             real.append(mask.cpu().numpy())
         cache.flush()
         np.save(draft / "real.npy", np.concatenate(real))
@@ -134,30 +147,18 @@ def prefill(bundle: Bundle, batch: dict[str, Any], length: int = 0) -> tuple[tor
     return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in cache.layers], 1), real
 
 
-def _as_cache(stored: torch.Tensor) -> DynamicCache:
-    cache = DynamicCache()
-    for layer in range(stored.shape[1]):
-        cache.update(stored[:, layer, 0], stored[:, layer, 1], layer)
-    return cache
-
-
 def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
     return torch.nn.functional.pad(tokens, (0, max(0, length - tokens.shape[1])))
 
 
-def _longest(bundle: Bundle, store: FrameStore) -> int:
-    """Number of tokens of the longest instruction in the data set."""
-    first = store.episodes.drop_duplicates("instruction").start.to_numpy()
-    return bundle.preprocess(batch_of_rows(store, first, bundle.policy.config.chunk_size))[OBS_LANGUAGE_TOKENS].shape[1]
-
-
-def _fingerprint(bundle: Bundle, store: FrameStore) -> str:
-    """Hash of everything that prefixes depend on: frozen weights, statistics and the data set."""
+def _fingerprint(bundle: Bundle, store: FrameStore, rows: np.ndarray) -> str:
+    """Hash of everything that prefixes depend on: frozen weights, statistics, the data set and its rows."""
     frozen = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if not p.requires_grad}
     digest = hashlib.sha256(save(frozen))
     for step in bundle.preprocess.steps:
         for name, value in sorted(step.state_dict().items()):
             digest.update(name.encode() + value.cpu().numpy().tobytes())
     digest.update(f"{store.root}|{len(store.states)}".encode() + np.ascontiguousarray(store.states).tobytes())
+    digest.update(rows.tobytes())
     digest.update("|".join(store.episodes.instruction).encode())
     return digest.hexdigest()[:16]

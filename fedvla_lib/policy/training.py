@@ -82,16 +82,9 @@ FRESH, FLOW_MATCHING = Start(), Objective()
 
 
 def local_train(
-    bundle: Bundle,
-    batches: TrainingBatches,
-    config: Config,
-    *,
-    steps: int,
-    start: Start = FRESH,
-    checkpoints: Checkpoints | None = None,
-    objective: Objective = FLOW_MATCHING,
-    progress: bool = True,
-) -> TrainResult:
+    bundle: Bundle, batches: TrainingBatches, config: Config, *, steps: int, start: Start = FRESH,
+    checkpoints: Checkpoints | None = None, objective: Objective = FLOW_MATCHING, progress: bool = True,
+) -> TrainResult:  # fmt: skip
     """Train the policy's trainable parameters in place for `steps` gradient steps.
 
     Raises:

@@ -53,8 +53,7 @@ class Questions:
         rng = np.random.default_rng([self.seed, ORDER_STREAM, step])
         rows = rng.integers(self.num_examples, size=self.batch_size)
         raw = {camera: images[rows] for camera, images in self.scenes.images.items()}
-        images = augmented(raw, np.random.default_rng([self.seed, AUGMENT_STREAM, step]))
-        return self._batch(rows, images, rng)
+        return self._batch(rows, augmented(raw, np.random.default_rng([self.seed, AUGMENT_STREAM, step])), rng)
 
     def plain(self, rows: np.ndarray) -> dict[str, Any]:
         """Return the batch of these scenes without augmentation; the sentences depend on the seed only."""
