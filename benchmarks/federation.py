@@ -26,17 +26,23 @@ def main() -> None:
     """Measure and report; each number of clients runs in its own process, so that memory peaks are separate."""
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--clients", type=int, default=10, help="number of clients")
-    parser.add_argument("--rounds", type=int, default=2, help="number of rounds")
+    parser.add_argument("--rounds", type=int, nargs="+", default=[2, 10], help="numbers of rounds")
     parser.add_argument("--alone", type=int, help="used internally: run with this many clients and print the numbers")
     chosen = parser.parse_args()
-    config = replace(laptop(chosen.profile), num_server_rounds=chosen.rounds, eval_rollouts=0, eval_every=0)
+    config = replace(laptop(chosen.profile), eval_rollouts=0, eval_every=0)
     if chosen.alone:
-        print(json.dumps(measure(replace(config, num_clients=chosen.alone))))
+        print(json.dumps(measure(replace(config, num_clients=chosen.alone, num_server_rounds=chosen.rounds[0]))))
         return
     recording(config)
-    one, many = (in_own_process(count, chosen) for count in (1, chosen.clients))
-    row = {
+    report("federation", [compared(rounds, chosen) for rounds in chosen.rounds], chosen.out)
+
+
+def compared(rounds: int, chosen: argparse.Namespace) -> dict[str, float]:
+    """Measure federations of `rounds` rounds, of one client and of many."""
+    one, many = (in_own_process(count, rounds, chosen.profile) for count in (1, chosen.clients))
+    return {
         "clients": chosen.clients,
+        "rounds": rounds,
         "wall time [s]": many["wall"],
         "clients' training and evaluation [s]": many["clients"],
         "ratio of times": many["wall"] / many["clients"],
@@ -46,13 +52,12 @@ def main() -> None:
         "peak memory with one client [MB]": one["memory"],
         "ratio of memories": many["memory"] / one["memory"],
     }
-    report("federation", [row], chosen.out)
 
 
-def in_own_process(count: int, chosen: argparse.Namespace) -> dict[str, float]:
+def in_own_process(count: int, rounds: int, profile: str) -> dict[str, float]:
     """Measure a federation of `count` clients."""
-    command = [sys.executable, __file__, "--alone", str(count), "--rounds", str(chosen.rounds)]
-    done = subprocess.run([*command, "--profile", chosen.profile], check=True, capture_output=True, text=True)
+    command = [sys.executable, __file__, "--alone", str(count), "--rounds", str(rounds), "--profile", profile]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -173,8 +173,9 @@ def _handle(app: ClientApp, message: Message, context: Context, raise_errors: bo
     The client gets a copy, as over a network, so that its changes do not reach the server's records.
     """
     began = time.perf_counter()
+    kept = {id(array): copy.copy(array) for of in message.content.array_records.values() for array in of.values()}
     try:
-        reply = app(copy.deepcopy(message), context)
+        reply = app(copy.deepcopy(message, kept), context)  # the bytes of arrays cannot be changed
     except Exception as error:
         if raise_errors:
             raise

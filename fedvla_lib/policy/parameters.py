@@ -88,7 +88,7 @@ def check_arrays(
             raise ParameterError("dtype", f"array {name!r} has dtype {array.dtype}, expected float32")
         if array.shape != shape:
             raise ParameterError("shape", f"array {name!r} has shape {array.shape}, expected {shape}")
-        if bad := int((~np.isfinite(array)).sum()):
+        if bad := array.size - np.count_nonzero(np.isfinite(array)):
             raise ParameterError("non-finite", f"array {name!r} has {bad} non-finite values")
     if expected_digest is not None:
         check_digest(arrays, expected_digest)

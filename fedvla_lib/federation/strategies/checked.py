@@ -20,7 +20,7 @@ from fedvla_lib.config import Config
 from fedvla_lib.federation import messages
 from fedvla_lib.federation.drift import geometry
 from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered
-from fedvla_lib.federation.quantisation import DOWNWARD, decode, encode
+from fedvla_lib.federation.quantisation import DOWNWARD, encode
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
 
@@ -53,6 +53,7 @@ class Checked:
         self._sampled: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
+        self._arrived: dict[int, Arrays] = {}  # in training replies, decoded, by node
 
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
@@ -125,9 +126,9 @@ class Checked:
 
     def _restore(self, reply: Message) -> None:
         """Replace the encoded update in a reply by the arrays: global arrays plus update."""
-        change = decode(messages.unpack_arrays(reply.content[messages.ARRAYS]), self.config.exchange)
-        arrays = {name: self._global[name] + change[name] for name in change}
-        reply.content[messages.ARRAYS] = messages.pack_arrays(arrays)
+        node = reply.metadata.src_node_id
+        self._arrived[node] = {name: self._global[name] + change for name, change in self._arrived[node].items()}
+        reply.content[messages.ARRAYS] = messages.pack_arrays(self._arrived[node])
 
     def _clip(self, reply: Message) -> None:
         """Scale a client's update down to the L2 norm `clip_norm`."""
@@ -141,8 +142,8 @@ class Checked:
 
     def _before_aggregation(self, server_round: int, valid: list[Message]) -> None:
         """Report the client drift of the valid training replies, before they are aggregated."""
-        name = self.roster.name
-        ends = {name(r.metadata.src_node_id): messages.unpack_arrays(r.content[messages.ARRAYS]) for r in valid}
+        nodes = [reply.metadata.src_node_id for reply in valid]
+        ends = {self.roster.name(node): self._arrived.pop(node) for node in nodes}
         for who, values in geometry(self._global, ends).items():
             self.report(server_round, who, "drift", values)
 
@@ -191,7 +192,8 @@ class Checked:
             found = f"{messages.EXAMPLES}={_examples(reply)}"
             raise ParameterError("examples", f"{found}, but the client first reported {announced}")
         exchange, also = self.config.exchange, self._extra_records
-        messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=also, exchange=exchange)
+        arrays = messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=also, exchange=exchange)
+        self._arrived[reply.metadata.src_node_id] = arrays
 
 
 def _check_evaluate(reply: Message) -> None:
