@@ -49,7 +49,10 @@ def compared(chosen: Namespace, config: Config, jobs: int) -> dict[str, Any]:
     """Measure both sides on `jobs` cores; on several, lerobot-eval has a process for each environment."""
     rows: list[dict] = []
     own_processes, seeds = jobs > 1, rollouts.rollout_seeds(chosen.rollouts)
+    all_cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, all_cores if own_processes else {min(all_cores)})
     ours_s = timed(lambda: rows.extend(ours(config, chosen.task, seeds, jobs)))
+    os.sched_setaffinity(0, all_cores)
     with tempfile.TemporaryDirectory() as folder:
         theirs_s, successes = lerobot_eval(chosen, config, Path(folder), own_processes)
     return {

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -56,11 +56,12 @@ def side_by_side(
     # Pickled here: PyTorch would put a policy's arrays into shared memory, which goes wrong between two forks.
     work, waiting, running = pickle.dumps(function), list(items), {}
     others = min(jobs, len(items)) - here
-    with processes(others, preload) as pool:
+    # In threads, since the start of a process blocks.
+    with ThreadPoolExecutor(others) as threads, processes(others, preload) as pool:
         while waiting or running:
-            while waiting and len(running) < others:  # no more: results that are not yet taken stay in memory
+            while waiting and len(running) < others + here:  # no more: results not yet taken stay in memory
                 item = waiting.pop(0)
-                running[pool.submit(_unpickled, work, item)] = item
+                running[threads.submit(lambda item=item: pool.submit(_unpickled, work, item).result())] = item
             if here and waiting:
                 yield waiting[0], function(waiting.pop(0))
             for done in wait(running, 0 if here and waiting else None, FIRST_COMPLETED).done:

@@ -81,6 +81,7 @@ def test_another_model_or_normalisation_gets_prefixes_of_its_own(store, tmp_path
     stats = normalisation.episode_stats(store, store.episodes.episode_id)
     stats[STATE_KEY]["mean"] = stats[STATE_KEY]["mean"] + 1
     prefix_cache.ensure_prefixes(model.load_policy(CONFIG, stats), store, folder=tmp_path)
+    prefix_cache.ensure_prefixes(fresh(store, replace(CONFIG, lora_rank=2)), store, folder=tmp_path)  # as the first
     assert len(list(tmp_path.iterdir())) == 3
 
 

@@ -36,14 +36,9 @@ FIRST_NODE_ID = SUPERLINK_NODE_ID + 1
 
 
 def run_inline(
-    config: Config,
-    *,
-    clients_app: ClientApp | None = None,
-    data: Sequence[Path] = (),
-    progress: bool = True,
-    raise_errors: bool = False,
-    jobs: int = 1,
-) -> Path:
+    config: Config, *, clients_app: ClientApp | None = None, data: Sequence[Path] = (), progress: bool = True,
+    raise_errors: bool = False, jobs: int = 1,
+) -> Path:  # fmt: skip
     """Run a federation in this process and return its run folder; results are bitwise reproducible.
 
     Args:

@@ -29,6 +29,7 @@ from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.spec import ACTION_KEY
 
 PREFIX_KEY = "prefix"  # in a batch: keys and values of its frames, and their padding mask
+BEFORE = ("model.vlm_with_expert.vlm.", "model.state_proj.")  # parameters that prefixes depend on
 BATCH = 64  # frames per forward pass while filling the store
 
 
@@ -152,13 +153,12 @@ def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
 
 
 def _fingerprint(bundle: Bundle, store: FrameStore, rows: np.ndarray) -> str:
-    """Hash of everything that prefixes depend on: frozen weights, statistics, the data set and its rows."""
-    frozen = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if not p.requires_grad}
-    digest = hashlib.sha256(save(frozen))
+    """Hash of everything that prefixes depend on: weights before the expert, statistics, the data set and its rows."""
+    weights = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if n.startswith(BEFORE)}
+    digest = hashlib.sha256(save(weights))
     for step in bundle.preprocess.steps:
         for name, value in sorted(step.state_dict().items()):
             digest.update(name.encode() + value.cpu().numpy().tobytes())
-    digest.update(f"{store.root}|{len(store.states)}".encode() + np.ascontiguousarray(store.states).tobytes())
-    digest.update(rows.tobytes())
+    digest.update(f"{store.root}|{len(store.states)}".encode() + store.states.tobytes() + rows.tobytes())
     digest.update("|".join(store.episodes.instruction).encode())
     return digest.hexdigest()[:16]
