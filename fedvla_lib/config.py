@@ -60,6 +60,7 @@ class Config:
     validate_every: int = 1  # rounds between saved global models, each evaluated on the held-out episodes
     eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 4  # rollouts per task at each evaluation of the global model
+    videos: bool = True  # record the rollouts of the global model on video
     client_rollouts: int = 1  # rollouts (with video) of the global model on each client at each evaluation
     action_tolerance_deg: float = 5.0  # maximum error, in degrees, of a predicted joint target that counts as accurate
     # run

@@ -1,5 +1,6 @@
 """The book's builder executes a chapter exactly when something it depends on changed, and lets no failure through."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -164,6 +165,17 @@ def test_a_chapter_waits_for_the_one_whose_run_it_uses_and_each_has_a_log(projec
     assert log.read_text() == "used\n" and log.parent == project / "_build" / "tiny" / "logs"
     said = capsys.readouterr().out
     assert said.index("maker: executed") < said.index("user: executed")
+
+
+@pytest.mark.unit
+def test_the_longest_chapters_start_first_after_an_awaited_one_and_a_short_one(tmp_path):
+    seconds = {"a": 10, "b": 30, "c": 20, "d": 40, "awaited": 5, "new": None}
+    costs = tmp_path / "costs.json"
+    costs.write_text(json.dumps({"chapters": {name: {"seconds": took} for name, took in seconds.items()}}))
+    chapters = [Path(f"{name}.ipynb") for name in seconds]
+    order = execution._longest_first(chapters, {chapters[0]: {Path("awaited.ipynb")}}, costs)
+    assert [path.stem for path in order] == ["awaited", "a", "new", "d", "b", "c"]
+    assert execution._longest_first(chapters[:1], {}, costs) == chapters[:1]
 
 
 @pytest.mark.unit

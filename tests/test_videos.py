@@ -37,6 +37,14 @@ def test_what_the_videos_say_is_what_the_run_measured(run, tmp_path, capsys):
     assert "0 damaged files" in capsys.readouterr().out
 
 
+def test_without_videos_the_global_models_rollouts_are_the_same(run, tmp_path):
+    other = inline.run_inline(replace(run_folder.read_config(run), videos=False, out=str(tmp_path)), progress=False)
+    seen, unseen = (run_folder.read_metrics(root, "rollout").query("who == 'global'") for root in (run, other))
+    same = ["round", "task", "seed", "success", "steps", "action_smoothness"]
+    pd.testing.assert_frame_equal(seen[same], unseen[same])
+    assert unseen.video.isna().all() and not list(other.glob("evaluate/*/global"))
+
+
 def test_damaged_files_are_listed_and_the_rest_is_counted(run, tmp_path, capsys):
     folder = tmp_path / "evaluate"
     shutil.copytree(run / "evaluate", folder)

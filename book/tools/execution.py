@@ -222,11 +222,15 @@ def execute_chapters(
 
 
 def _longest_first(notebooks: list[Path], needed: dict[Path, set[Path]], costs: Path) -> list[Path]:
-    """Return chapters that others wait for, then the rest, the longest first by their kept costs."""
+    """Return chapters that others wait for, then the rest, the longest first by their kept costs.
+
+    The shortest is the second, while the first computes what most chapters find in the cache.
+    """
     kept = json.loads(costs.read_text(encoding="utf-8"))["chapters"] if costs.is_file() else {}
     awaited = set().union(*needed.values())
     seconds = {path: kept.get(path.stem, {}).get("seconds") or math.inf for path in notebooks}
-    return sorted(notebooks, key=lambda path: (path not in awaited, -seconds[path]))
+    longest = sorted(notebooks, key=lambda path: (path not in awaited, -seconds[path]))
+    return [*longest[:1], *longest[-1:], *longest[1:-1]] if len(longest) > 1 else longest
 
 
 def _one_after_another(

@@ -135,13 +135,13 @@ def _num_recorded(root: Path) -> int:
 def _record_missing(root: Path, settings: dict[str, Any], missing: range, progress: bool) -> None:
     """Record the episodes that are missing in `root`, in their order."""
     write_json(root / SETTINGS_FILE, settings)
-    done, total, waiting = missing.start, missing.stop, {}
+    done, total, waiting, work = missing.start, missing.stop, {}, partial(_demonstrated, settings)
     jobs = default_jobs() if len(missing) >= WORTH_WORKERS else 1
     bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
     stage = stage_of_process(settings["image_size"], settings["jitter"])
     with closing(stage), closing(EpisodeWriter(root, settings, done)) as recorder, bar:
         try:
-            for index, demonstrated in side_by_side(partial(_demonstrated, settings), missing, jobs):
+            for index, demonstrated in side_by_side(work, missing, jobs, preload=("lerobot.datasets",)):
                 waiting[index] = demonstrated
                 while done in waiting:
                     recorder.add(*waiting.pop(done))

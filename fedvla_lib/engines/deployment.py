@@ -119,14 +119,9 @@ def running_deployment(
 
 
 def run_deployed(
-    config: Config,
-    *,
-    tls: bool = True,
-    auth: bool = True,
-    data: Sequence[Path] = (),
-    timeout_s: float = 24 * 3600.0,
+    config: Config, *, tls: bool = True, auth: bool = True, data: Sequence[Path] = (), timeout_s: float = 24 * 3600.0,
     say: Callable[[str], None] = print_line,
-) -> Path:
+) -> Path:  # fmt: skip
     """Run a federation on a temporary deployment and return its run folder.
 
     Args:

@@ -157,5 +157,6 @@ MEASURES = dict(zip(KINDS, (_base, _federated, _centralized, _local_only, _clien
 
 
 def with_recording(config: Config) -> Config:
-    """Return settings with the path of the recording, which is the same for all training seeds."""
-    return config if config.data else replace(config, data=str(recordings.resolve(replace(config, seed=0))))
+    """Return settings with the path of the recording, the same for all training seeds, and without videos."""
+    data = config.data or str(recordings.resolve(replace(config, seed=0)))
+    return replace(config, data=data, videos=False)  # nothing shows them

@@ -138,7 +138,8 @@ class RoundEnd:
         due = measure.rolls_out(self.config, round_number)
         found = measure.measure(
             self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
-            videos_dir=self.run.videos_dir(round_number, GLOBAL), progress=self.progress, jobs=self.jobs,
+            videos_dir=self.run.videos_dir(round_number, GLOBAL) if self.config.videos else None,
+            progress=self.progress, jobs=self.jobs,
         )  # fmt: skip
         measure.log_measurement(self.run, round_number, GLOBAL, found)
         values = found.averages | found.success() | found.success_by_task(task_names(self.config))

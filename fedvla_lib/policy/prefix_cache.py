@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from lerobot.policies.common.flow_matching import euler_integrate
 from lerobot.policies.common.vla_utils import make_att_2d_masks
 from lerobot.policies.smolvla import SmolVLAPolicy
@@ -106,8 +107,10 @@ def ensure_prefixes(
     """Return the prefixes of `rows`, by default all, under this model, computing them into `folder` if needed."""
     rows = np.arange(len(store.states)) if rows is None else rows
     target = (folder or cache_dir() / "prefixes") / _fingerprint(bundle, store, rows)
-    if not target.is_dir():
-        _fill(bundle, store, rows, target, progress)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(target.with_suffix(".lock")):  # so that concurrent processes compute them once
+        if not target.is_dir():
+            _fill(bundle, store, rows, target, progress)
     return PrefixStore(rows, np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
 
 
