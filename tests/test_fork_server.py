@@ -33,7 +33,7 @@ def calls(tmp_path, monkeypatch):
     (tmp_path / "its script.py").write_text(SCRIPT)
     plain = superlink.flower_environment(tmp_path)
     with warm_start.warm_start(plain, tmp_path / "log") as environment:
-        (server,) = [one for one in psutil.Process().children() if str(warm_start.FORK_SERVER) in one.cmdline()]
+        server = the_server()
 
         def call(*arguments):
             command = [stand_in(environment, warm_start.PYTHON), str(tmp_path / "its script.py"), *arguments]
@@ -43,6 +43,16 @@ def calls(tmp_path, monkeypatch):
         yield call, server
     assert not server.is_running() or server.status() == psutil.STATUS_ZOMBIE
     assert not list(Path(stand_in(environment, warm_start.PYTHON)).parent.glob("*"))
+
+
+def the_server(within_s=10):
+    """The fork server that this process started; for a moment after its start a process has no command line."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        for child in psutil.Process().children():
+            if str(warm_start.FORK_SERVER) in child.cmdline():
+                return child
+    raise AssertionError("no fork server was started")
 
 
 def stand_in(environment, name):
