@@ -107,10 +107,11 @@ def ensure_prefixes(
     """Return the prefixes of `rows`, by default all, under this model, computing them into `folder` if needed."""
     rows = np.arange(len(store.states)) if rows is None else rows
     target = (folder or cache_dir() / "prefixes") / _fingerprint(bundle, store, rows)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(target.with_suffix(".lock")):  # so that concurrent processes compute them once
-        if not target.is_dir():
-            _fill(bundle, store, rows, target, progress)
+    if not target.is_dir():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(target.with_suffix(".lock")):  # so that concurrent processes compute them once
+            if not target.is_dir():
+                _fill(bundle, store, rows, target, progress)
     return PrefixStore(rows, np.load(target / "cache.npy", mmap_mode="r"), np.load(target / "real.npy"))
 
 
