@@ -26,7 +26,13 @@ TERMINATED = 143  # exit status after SIGTERM, as shells report it
 
 
 def default_jobs(device: str = "cpu") -> int:
-    """Return ``$FEDVLA_JOBS``, or else one job for each core, as many as free memory allows; one on a GPU."""
+    """Return ``$FEDVLA_JOBS``, or else one job for each core, as many as free memory allows; one on a GPU.
+
+    Raises:
+        RuntimeError: a worker is importing the script that started it, and would start workers of its own.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise RuntimeError("a script's workers import it: put its calls below if __name__ == '__main__':")
     chosen = os.environ.get("FEDVLA_JOBS", "")
     if chosen and not (chosen.isdecimal() and int(chosen)):
         raise ValueError(f"FEDVLA_JOBS={chosen!r} is not usable: give a whole number from 1")

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import time
 
 # Before the first import of torch, MuJoCo or the hub's client: each reads its variables once.
@@ -108,6 +109,18 @@ def one_thread() -> None:
     import torch
 
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+
+
+@pytest.fixture(scope="session")
+def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A program that runs a Python script in a process of its own, and need not wait until PyTorch is loaded.
+
+    As Ray's workers are started in `engines`. Where that cannot be, the Python that runs the tests.
+    """
+    from fedvla_lib.engines.warm_start import PYTHON, warm_start
+
+    with warm_start(dict(os.environ), tmp_path_factory.mktemp("warm") / "log") as environment:
+        yield shutil.which(PYTHON, path=environment["PATH"]) or sys.executable
 
 
 @pytest.fixture(scope="session")

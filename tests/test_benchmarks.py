@@ -1,9 +1,8 @@
 """The benchmarks run, and both sides of them compute the same thing; how fast they are is not tested."""
 
 import json
-import os
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,69 +14,74 @@ pytestmark = [pytest.mark.integration, pytest.mark.slow]
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
 
-def run(name: str, out: Path, *arguments: str) -> list[dict]:
-    command = [sys.executable, str(FOLDER / f"{name}.py"), "--profile", "tiny", "--repeats", "1", "--out", str(out)]
-    settings = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=600, env=settings)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads((out / f"{name}.json").read_text())["rows"]
+@pytest.fixture
+def run(warm_python, tmp_path) -> Callable[..., list[dict]]:
+    """Call a benchmark, and return the rows that it wrote."""
+
+    def call(name: str, *arguments: str) -> list[dict]:
+        command = [warm_python, FOLDER / f"{name}.py", "--profile", "tiny", "--repeats", "1", "--out", tmp_path]
+        done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stderr[-2000:]
+        return json.loads((tmp_path / f"{name}.json").read_text())["rows"]
+
+    return call
 
 
-def test_local_training_computes_what_lerobot_computes(tmp_path):
-    for row in run("local_training", tmp_path, "--steps", "7", "--workers", "0", "1"):
+def test_local_training_computes_what_lerobot_computes(run):
+    for row in run("local_training", "--steps", "7", "--workers", "0", "1"):
         assert row["largest loss difference"] <= 1e-6
         assert row["ours [samples/s]"] > 0 < row["lerobot [samples/s]"]
 
 
 @pytest.mark.parametrize("name", ["random_access", "control_steps"])
-def test_a_ratio_is_reported(name, tmp_path):
-    (row,) = run(name, tmp_path)
+def test_a_ratio_is_reported(name, run):
+    (row,) = run(name)
     assert row["ratio"] > 0
 
 
-def test_the_floor_is_below_what_is_measured(tmp_path):
-    kept, whole = run("floor", tmp_path)
+def test_the_floor_is_below_what_is_measured(run):
+    kept, whole = run("floor")
     assert 0 < kept["operations [G]"] < whole["operations [G]"]
     assert kept["times the floor"] > 1 and whole["times the floor"] > 1
 
 
-def test_ours_is_measured_without_the_peers(tmp_path):
-    (row,) = run("peers", tmp_path, "--peers")
+def test_ours_is_measured_without_the_peers(run):
+    (row,) = run("peers", "--peers")
     assert row["simulator"] == "this library" and row["ours is faster by"] == 1
 
 
-def test_the_base_is_trained_and_acts(tmp_path):
-    (row,) = run("fine_tuning", tmp_path, "--tasks", "lift", "--demonstrations", "2", "--steps", "2", "--rollouts", "1")
+def test_the_base_is_trained_and_acts(run):
+    (row,) = run("fine_tuning", "--tasks", "lift", "--demonstrations", "2", "--steps", "2", "--rollouts", "1")
     assert row["demonstrations"] == 2 and row["rollouts"] == 1 and row["training [s]"] > 0
 
 
-def test_every_client_is_compared_with_the_federation(tmp_path):
+def test_every_client_is_compared_with_the_federation(tmp_path, run):
     arguments = ["--seeds", "0", "--rollouts", "1", "--threads", "1"]  # another worker of the tests has the other core
-    found = {row["method"]: row for row in run("four_methods", tmp_path, *arguments)}
+    found = {row["method"]: row for row in run("four_methods", *arguments)}
     tasks, clients = 3, from_profile("tiny").num_clients
     assert found["federated"]["rollouts"] == tasks and found["all clients alone"]["rollouts"] == tasks * clients
     (kept,) = (tmp_path / "four_methods").glob("*.json")
     before = kept.stat().st_mtime_ns
-    assert {row["method"]: row for row in run("four_methods", tmp_path, *arguments)} == found
+    assert {row["method"]: row for row in run("four_methods", *arguments)} == found
     assert kept.stat().st_mtime_ns == before  # not measured again
 
 
-def test_bad_input_is_one_line_that_names_it(tmp_path):
-    command = [sys.executable, str(FOLDER / "fine_tuning.py"), "--tasks", "juggle", "--out", str(tmp_path)]
+def test_bad_input_is_one_line_that_names_it(tmp_path, warm_python):
+    command = [warm_python, FOLDER / "fine_tuning.py", "--tasks", "juggle", "--out", tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode and "juggle" in done.stderr and "lift" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and not list(tmp_path.iterdir())
 
 
-def test_a_federation_is_measured_against_its_clients(tmp_path):
-    (row,) = run("federation", tmp_path, "--clients", "2", "--rounds", "1")
+def test_a_federation_is_measured_against_its_clients(run):
+    (row,) = run("federation", "--clients", "2", "--rounds", "1")
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0
     assert row["peak memory [MB]"] > 0
 
 
-def test_rounds_are_timed_for_each_number_of_clients(tmp_path):
-    (before,) = run("scale", tmp_path, "--clients", "2", "--engines", "inline")
-    rows = run("scale", tmp_path, "--clients", "13", "--engines", "inline")
+def test_rounds_are_timed_for_each_number_of_clients(run):
+    (before,) = run("scale", "--clients", "2", "--engines", "inline")
+    rows = run("scale", "--clients", "13", "--engines", "inline")
     assert [row["clients"] for row in rows] == [2, 13]  # more than the recording has episodes
     assert rows[0] == before  # measured once, and kept
     assert all(row["later rounds [s]"] > 0 and row["peak memory [MB]"] > 100 for row in rows)
@@ -85,8 +89,8 @@ def test_rounds_are_timed_for_each_number_of_clients(tmp_path):
     assert [row["against fewer clients"] for row in rows] == [None, pytest.approx(many / few)]
 
 
-def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path):
+def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path, run):
     model.save_policy(model.load_policy(from_profile("tiny")), tmp_path / "policy")
     arguments = ["--policy", str(tmp_path / "policy"), "--rollouts", "2", "--batch", "2"]
-    for row in run("rollouts", tmp_path, *arguments):
+    for row in run("rollouts", *arguments):
         assert row["rollouts"] == 2 and row["seeds that agree"] == 2

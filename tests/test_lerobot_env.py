@@ -86,13 +86,13 @@ def test_an_unknown_task_is_named_with_the_valid_ones():
 
 
 @pytest.mark.slow
-def test_lerobot_eval_runs_a_saved_policy(tmp_path):
+def test_lerobot_eval_runs_a_saved_policy(tmp_path, warm_python):
     """The documented command, with a nano SmolVLA with random weights."""
     config = from_profile("tiny", base="nano-random", num_threads=1)
     stats = {key: {"mean": np.zeros(6), "std": np.ones(6)} for key in (STATE_KEY, ACTION_KEY)}
     model.save_policy(model.load_policy(config, stats), tmp_path / "policy")
     command = [
-        sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={tmp_path / 'policy'}",
+        warm_python, Path(sys.executable).with_name("lerobot-eval"), f"--policy.path={tmp_path / 'policy'}",
         "--policy.device=cpu", "--env.type=so100_sim", "--env.task=lift", f"--env.image_size={config.image_size}",
         "--env.discover_packages_path=fedvla_lib.robot.lerobot_env", "--eval.n_episodes=1", "--eval.batch_size=1",
         f"--output_dir={tmp_path / 'out'}",

@@ -26,6 +26,12 @@ if __name__ == "__main__":
     list(workers.side_by_side(work, range(3), 2, preload=()))
 """
 
+UNGUARDED = """
+import sys
+from fedvla_lib.data.record import record
+record(["lift"], 30, sys.argv[1], image_size=16, progress=False)
+"""
+
 
 def square(number: int) -> tuple[int, int, int, str]:
     return number**2, os.getpid(), torch.get_num_threads(), os.environ["FEDVLA_JOBS"]
@@ -93,6 +99,15 @@ def test_workers_end_with_their_parent(tmp_path, sign):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.1)
     assert not (tmp_path / "2").exists()
+
+
+def test_a_script_that_workers_would_start_again_is_told_so_and_ends(tmp_path):
+    """They import it, so a call outside `if __name__ == "__main__":` would wait for the lock of the script itself."""
+    (tmp_path / "unguarded.py").write_text(UNGUARDED)
+    command = [sys.executable, tmp_path / "unguarded.py", tmp_path / "recording"]
+    environment = {**os.environ, "FEDVLA_JOBS": "2"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "put its calls below if __name__ == '__main__':" in done.stderr
 
 
 def test_the_number_of_jobs_is_set_by_the_environment_or_the_machine(monkeypatch):

@@ -99,7 +99,7 @@ def _card_tables(account: dict) -> str:
     """Results of pretraining the nano base, for the end of its page."""
     recipe, stamp = account["recipe"], account["stamp"]
     seen = account["grounding"]
-    batch, cores = recipe["batch_size"], "one core" if recipe["num_threads"] == 1 else f"{recipe['num_threads']} cores"
+    batch, cores = recipe["batch_size"], _cores(recipe["num_threads"])
     facts = {
         "parameters": f"{account['parameters']:,}",
         "grounding scenes": f"{recipe['scenes']:,}",
@@ -137,9 +137,13 @@ def _benchmark_tables(files: list[Path]) -> str:
         result = json.loads(path.read_text(encoding="utf-8"))
         rows = [[_number(value) for value in row.values()] for row in result["rows"]]
         title = TITLES.get(path.stem, path.stem.replace("_", " "))
-        machine = f"On {result['machine']['cores']} cores ({result['machine']['system']})."
+        machine = f"On {_cores(result['machine']['cores'])} ({result['machine']['system']})."
         parts.append(f"## {title[0].upper()}{title[1:]}\n\n{machine}\n\n{status.table(list(result['rows'][0]), rows)}")
     return "\n".join(parts)
+
+
+def _cores(count: int) -> str:
+    return "one core" if count == 1 else f"{count} cores"
 
 
 def _number(value: object) -> str:

@@ -34,16 +34,9 @@ MAX_ATTEMPTS = 20  # seeds tried per episode until the expert succeeds
 
 
 def record(
-    tasks: list[str],
-    episodes_per_task: int,
-    root: str | Path,
-    *,
-    image_size: int,
-    seed: int = 0,
-    num_labs: int = 1,
-    jitter: float = 0.0,
-    progress: bool = True,
-) -> Path:
+    tasks: list[str], episodes_per_task: int, root: Path | str, *, image_size: int, seed: int = 0, num_labs: int = 1,
+    jitter: float = 0.0, progress: bool = True,
+) -> Path:  # fmt: skip
     """Record successful expert episodes of `tasks` into the LeRobotDataset v3.0 folder `root`, and return it.
 
     Episode i shows ``tasks[i % len(tasks)]`` in lab ``(i // len(tasks)) % num_labs`` (`robot.labs.labs`). Existing
@@ -68,10 +61,12 @@ def record(
     total = episodes_per_task * len(settings["tasks"])
     if _num_recorded(root) == total:
         return root
+    # Before the lock, for which a worker would wait that is refused more of them.
+    jobs = default_jobs() if total - _num_recorded(root) >= WORTH_WORKERS else 1
     root.mkdir(parents=True, exist_ok=True)
     with FileLock(root / LOCK):
         _check_folder(root, settings)  # the previous holder of the lock may have recorded something else
-        _record_missing(root, settings, range(_num_recorded(root), total), progress)
+        _record_missing(root, settings, range(_num_recorded(root), total), jobs, progress)
     return root
 
 
@@ -132,11 +127,10 @@ def _num_recorded(root: Path) -> int:
     return json.loads(path.read_text())["total_episodes"] if path.exists() else 0
 
 
-def _record_missing(root: Path, settings: dict[str, Any], missing: range, progress: bool) -> None:
+def _record_missing(root: Path, settings: dict[str, Any], missing: range, jobs: int, progress: bool) -> None:
     """Record the episodes that are missing in `root`, in their order."""
     write_json(root / SETTINGS_FILE, settings)
     done, total, waiting, work = missing.start, missing.stop, {}, partial(_demonstrated, settings)
-    jobs = default_jobs() if len(missing) >= WORTH_WORKERS else 1
     bar = tqdm(initial=done, total=total, desc=f"recording {root.name}", unit="episode", disable=not progress)
     stage = stage_of_process(settings["image_size"], settings["jitter"])
     with closing(stage), closing(EpisodeWriter(root, settings, done)) as recorder, bar:
