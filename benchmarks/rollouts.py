@@ -5,8 +5,8 @@ same noise: the policy's k-th chunk in a scene uses the k-th draw of one generat
 same rollouts should succeed. lerobot-eval is measured twice: on one core like this library, with all environments in
 its own process, and with its defaults, one process per environment on all cores.
 
-lerobot-eval's clock starts when its policy is loaded and its environments' processes run. So this library is timed twice:
-as a call finds it, and once more, when the policy and a process to fork workers from are there.
+lerobot-eval's clock starts when its policy is loaded and its environments' processes run. So this library is timed
+twice: as a call finds it, and once more, when the policy and a process to fork workers from are there.
 
     python benchmarks/rollouts.py --policy outputs/DATE_TIME/global_model/round_8
 """
