@@ -2,7 +2,7 @@
 
 The floor is the floating-point operations of a step's matrix products divided by the rate at which one core multiplies
 matrices that fit into its cache. With --compile a row shows what a compiler makes of LeRobot's pass over the action
-expert; it needs a C++ compiler, and half a minute before the first step.
+expert; it needs a C++ compiler, and compiles before the first step.
 
     python benchmarks/floor.py --compile
 """

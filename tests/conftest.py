@@ -111,11 +111,12 @@ def one_thread() -> None:
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A program that runs a Python script in a process of its own, and need not wait until PyTorch is loaded.
 
-    As Ray's workers are started in `engines`. Where that cannot be, the Python that runs the tests.
+    As Ray's workers are started in `engines`. Where that cannot be, the Python that runs the tests. It ends with a
+    module, since others look for a fork server of their own among this process's children.
     """
     from fedvla_lib.engines.warm_start import PYTHON, warm_start
 

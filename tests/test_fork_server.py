@@ -46,13 +46,13 @@ def calls(tmp_path, monkeypatch):
 
 
 def the_server(within_s=10):
-    """The fork server that this process started; for a moment after its start a process has no command line."""
+    """The only fork server that this process started; for a moment after its start a process has no command line."""
     deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
-        for child in psutil.Process().children():
-            if str(warm_start.FORK_SERVER) in child.cmdline():
-                return child
-    raise AssertionError("no fork server was started")
+    found = []
+    while not found and time.monotonic() < deadline:
+        found = [child for child in psutil.Process().children() if str(warm_start.FORK_SERVER) in child.cmdline()]
+    (server,) = found
+    return server
 
 
 def stand_in(environment, name):

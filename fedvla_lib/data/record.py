@@ -34,7 +34,7 @@ MAX_ATTEMPTS = 20  # seeds tried per episode until the expert succeeds
 
 
 def record(
-    tasks: list[str], episodes_per_task: int, root: Path | str, *, image_size: int, seed: int = 0, num_labs: int = 1,
+    tasks: list[str], episodes_per_task: int, root: str | Path, *, image_size: int, seed: int = 0, num_labs: int = 1,
     jitter: float = 0.0, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Record successful expert episodes of `tasks` into the LeRobotDataset v3.0 folder `root`, and return it.
@@ -61,7 +61,7 @@ def record(
     total = episodes_per_task * len(settings["tasks"])
     if _num_recorded(root) == total:
         return root
-    # Before the lock, for which a worker would wait that is refused more of them.
+    # Before the lock: a worker that imports the caller's script would wait for it, instead of being refused.
     jobs = default_jobs() if total - _num_recorded(root) >= WORTH_WORKERS else 1
     root.mkdir(parents=True, exist_ok=True)
     with FileLock(root / LOCK):
