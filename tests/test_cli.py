@@ -20,6 +20,7 @@ from fedvla_lib.cli.commands import settings
 from fedvla_lib.cli.main import main
 from fedvla_lib.cli.parser import build_parser
 from fedvla_lib.config import Config, from_profile, from_run_config
+from fedvla_lib.engines import inline
 from fedvla_lib.evaluation.statistics import P_VALUES
 from fedvla_lib.files import write_json
 
@@ -176,6 +177,17 @@ def test_a_run_that_fails_is_status_2_and_a_line_with_the_reason(recording, tmp_
     assert main(["run", *flags]) == 2
     said = capfd.readouterr().err.splitlines()[-1]
     assert said.startswith("fedvla run: 3 of 3 clients could be used, min-replies=9 are required")
+
+
+@pytest.mark.unit
+def test_a_small_run_starts_no_workers_unless_told_to(monkeypatch):
+    asked = []
+    monkeypatch.setattr(inline, "run_inline", lambda config, jobs: asked.append(jobs))
+    monkeypatch.setattr(commands, "_print_rounds", lambda root: None)
+    monkeypatch.setenv("FEDVLA_JOBS", "3")
+    for words in (["--profile", "tiny"], ["--profile", "tiny", "--jobs", "2"], ["--profile", "laptop"]):
+        assert main(["run", *words]) == 0
+    assert asked == [1, 2, 3]
 
 
 @pytest.mark.integration

@@ -103,8 +103,7 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
     )  # fmt: skip
     log_measurement(folder, 0, LOCAL, found)
     measured = found.averages | found.success()
-    counted = {"gradient_steps": result.steps, "num_examples": found.num_examples}
-    folder.log(0, LOCAL, "evaluate", counted | measured)
+    folder.log(0, LOCAL, "evaluate", {"gradient_steps": result.steps, "num_examples": found.num_examples} | measured)
     print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
     print(f"on {found.num_examples} held-out frames: " + ", ".join(f"{k} {v:.3f}" for k, v in measured.items()))
     print(folder.root / "model")
@@ -117,7 +116,9 @@ def run(options: argparse.Namespace) -> None:
     config = _new_or_resumed(options)
     if options.engine == "simulation":
         return _print_rounds(simulation.run_simulation(config))
-    _print_rounds(inline.run_inline(config, jobs=_jobs(options, config.device)))
+    steps = config.num_server_rounds * config.num_clients * config.fraction_train * config.local_steps
+    jobs = _jobs(options, config.device) if options.jobs or steps >= 400 else 1  # fewer end before workers start
+    _print_rounds(inline.run_inline(config, jobs=jobs))
 
 
 def _new_or_resumed(options: argparse.Namespace) -> Config:

@@ -54,7 +54,7 @@ def _metrics(default: str) -> Flag:
 
 
 def _jobs(what: str) -> Flag:
-    return _flag("--jobs", f"{what} at a time, each in a process (default: $FEDVLA_JOBS, else one per core)", "N")
+    return _flag("--jobs", f"{what} at a time (default: $FEDVLA_JOBS, else one per core; one for little work)", "N")
 
 
 def _recipe() -> list[Flag]:
