@@ -112,12 +112,12 @@ def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> Non
 def run(options: argparse.Namespace) -> None:
     """Run a federation and print the measurements of the global model by round."""
     from fedvla_lib.engines import inline, simulation
+    from fedvla_lib.experiments.methods import total_steps
 
     config = _new_or_resumed(options)
     if options.engine == "simulation":
         return _print_rounds(simulation.run_simulation(config))
-    steps = config.num_server_rounds * config.num_clients * config.fraction_train * config.local_steps
-    jobs = _jobs(options, config.device) if options.jobs or steps >= 400 else 1  # fewer end before workers start
+    jobs = _jobs(options, config.device) if options.jobs or total_steps(config) >= 400 else 1  # fewer end sooner
     _print_rounds(inline.run_inline(config, jobs=jobs))
 
 
