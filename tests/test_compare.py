@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from fedvla_book import tables
 from fedvla_book.tables import grids
 from fedvla_lib.evaluation import statistics
 
@@ -37,18 +36,6 @@ def test_wilson_solves_its_defining_equation(k, n):
 def test_wilson_refuses_impossible_counts(k, n):
     with pytest.raises(ValueError, match=f"successes={k} of trials={n}"):
         statistics.wilson(k, n)
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "published"),
-    [
-        ((56, 70), (48, 80), (0.0524, 0.3339)),
-        ((9, 10), (3, 10), (0.1705, 0.8090)),
-        ((5, 56), (0, 29), (-0.0381, 0.1926)),
-    ],
-)
-def test_the_unpaired_difference_is_that_of_newcombe_s_table(left, right, published):
-    assert tables.unpaired_difference(left, right) == pytest.approx(published, abs=6e-5)
 
 
 @pytest.mark.parametrize(("n", "lowest"), [(20, 0.92), (60, 0.93), (100, 0.93), (300, 0.94)])

@@ -44,7 +44,6 @@ COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the fol
     "compare": ["compare", "{inline}/2*", "{other}/2*", "--out", "{D}"],
     "videos": ["videos", "{inline}/*/evaluate", "--out", "{D}"],
     "experiment": ["experiment", "{D}/plan.toml", "--out", "{D}/grid"],
-    "search": ["search", *RUN, "--trials", "2", "--rollouts", "1", "--search-out", "{D}"],
     "experts": ["experts", "--task", "lift", "--episodes", "2"],
     "config": ["config", "--profile", "tiny"],
     "credentials": ["credentials", "--host", "server", "--nodes", "2", "--out", "{D}/keys"],
@@ -54,7 +53,7 @@ COMMANDS = {  # name -> arguments; {D} is a folder for this command, {X} the fol
     "help": ["--help"],
 }
 HELPED = ("record", "pretrain", "experts", "config", "train", "run", "deploy", "superlink", "credentials", "evaluate",
-          "experiment", "search", "compare", "videos", "doctor")  # fmt: skip
+          "experiment", "compare", "videos", "doctor")  # fmt: skip
 COMMANDS |= {f"{name} --help": [name, "--help"] for name in HELPED}
 MASKS = [
     (r"(?<!\d)\d{8}_\d{6}(_\d{6})?(?!\d)", "TIME"), (r"\b\d+(\.\d+)? (s|seconds|GiB|MB)\b", "N \\2"),

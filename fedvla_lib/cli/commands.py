@@ -204,19 +204,6 @@ def _jobs(options: argparse.Namespace, device: str) -> int:
     return options.jobs or default_jobs(device)
 
 
-def search(options: argparse.Namespace) -> None:
-    """Search for settings; print the budget, the best settings and their results on data not used for the search."""
-    from fedvla_lib.experiments import search
-
-    found = search.search(settings(options), options.trials, options.rollouts, options.search_out)
-    print(f"{len(found['trials'])} trials of {found['budget']} gradient steps each")
-    print("winner: " + ", ".join(f"{name.replace('_', '-')}={value:.3g}" for name, value in found["winner"].items()))
-    for name in ("start", "best"):
-        line = found[name]
-        print(f"{name}: held-out loss {line['loss']:.3f}, {line['successes']} of {line['n']} rollouts succeed")
-    print(options.search_out / "search.json")
-
-
 def evaluate(options: argparse.Namespace) -> None:
     """Roll out a saved policy and print its success rates by task."""
     from fedvla_lib.evaluation import rollouts

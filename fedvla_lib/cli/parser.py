@@ -83,7 +83,7 @@ GIVEN = {"default": argparse.SUPPRESS}  # only given flags override the profile
 NEEDED = {"required": True}
 PROFILE = _flag("--profile", f"one of {', '.join(PROFILES)} (default: $FEDVLA_PROFILE, else laptop)", "NAME")
 RESUME = _flag("--resume", "run folder of an interrupted run to resume with its own settings", "RUN_FOLDER")
-WITH_SETTINGS = (commands.config, commands.train, commands.run, commands.deploy, commands.search)
+WITH_SETTINGS = (commands.config, commands.train, commands.run, commands.deploy)
 COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
     (commands.doctor, "check that this machine can run the book", NOTHING, []),
     (commands.record, "record expert demonstrations as a LeRobot data set",
@@ -142,12 +142,6 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
         _flag("file", "the plan, a TOML file; see fedvla_lib/experiments/experiment_file.py", type=Path),
         _flag("--out", "the folder for the results, a run folder per cell", "DIR", **NEEDED),
         _jobs("cells"),
-    ]),
-    (commands.search, "tune the settings of a federated run at a fixed budget of gradient steps",
-     f"finished trials are kept, {CONTINUES}", [
-        _flag("--trials", "settings to try (default: 20)", "N", default=20),
-        _flag("--rollouts", "rollouts per task with the first and the best settings (default: 20)", "N", default=20),
-        _flag("--search-out", "the folder for the trials and the result", "DIR", **NEEDED), PROFILE,
     ]),
     (commands.compare, "compare runs, paired by held-out episode and by rollout", NOTHING, [
         _flag("runs", "run folders; the first is the reference", "RUN", nargs="+"),

@@ -1,6 +1,6 @@
 """Evaluate one model: error on held-out episodes, then success in closed loop.
 
-Shared by federated rounds, centralized training, experiment cells and searches.
+Shared by federated rounds, centralized training and experiment cells.
 """
 
 from collections.abc import Sequence

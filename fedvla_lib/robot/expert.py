@@ -2,11 +2,11 @@
 
 The path is a list of `Waypoint`s for the grasp point between the finger tips; the gripper always points down. The speed
 between waypoints is smooth, so that demonstrations have no jumps or pauses and the next action follows from the images
-and the joint positions.
+and the joint positions. A lab's operator adds habits: pace, approach, grasp, pauses, corrections.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from fedvla_lib.robot.layout import CUBE_HALF_M, Cube, Layout, cartesian
+from fedvla_lib.robot.operators import Operator
 from fedvla_lib.robot.rollout import run_episode
 from fedvla_lib.robot.scene import GRASP_SITE, build_arm
 from fedvla_lib.robot.sim import So100Env, from_radians, to_radians
@@ -34,6 +35,9 @@ PULL_M = 0.032
 DRAG_RAD, NUDGE_RAD = np.deg2rad(17.0), np.deg2rad(16.0)
 SIDESTEP_M = 0.009  # offset of the open jaws towards the fixed jaw, so that neither touches the cube on the way down
 CLOSE_STEPS = OPEN_STEPS = 4
+PAUSE_STEPS = (2, 6)  # shortest and longest pause of an operator who hesitates
+WRONG_AIM_M, WRONG_AIM_HEIGHT_M = 0.016, 0.050  # where a descent that will be corrected aims, beside the cube
+SLIP_M = 0.006  # how far from the goal an imperfect demonstration releases the cube; its grasp is off twice as far
 MIN_STEPS = 4
 SPEED_M = 0.011  # mean distance per control step
 SOLVER_STEPS = 60  # maximum inverse kinematics iterations per control step
@@ -58,10 +62,10 @@ class Expert:
         self._arm = _Arm()
 
     def reset(self, env: Any, seed: int) -> None:
-        """Plan the episode in `env`, a `So100Env` that has just been reset. `seed` is not used."""
+        """Plan the episode in `env`, a `So100Env` that has just been reset; `seed` fixes what its operator does."""
         sim: So100Env = env.unwrapped
         self._offset = sim.joint_offset  # the plan is in true angles, commands are in reported ones
-        start = _Plan([self._arm.start(sim.joints - self._offset)])
+        start = _Plan(self._arm.start(sim.joints - self._offset), sim.lab.operator, np.random.default_rng(seed))
         self._path = _interpolate(PLANS[sim.task](start, sim.layout, sim.layout.cubes[0]))
         self._step = 0
 
@@ -131,11 +135,31 @@ def _smooth(progress: float) -> float:
 class _Plan(list[Waypoint]):
     """Waypoints, the first of them where the gripper is; every method appends some and returns the plan."""
 
+    def __init__(self, start: Waypoint, operator: Operator, rng: np.random.Generator) -> None:
+        super().__init__([start])
+        self._operator, self._rng = operator, rng
+        self._speed_m = SPEED_M * operator.speed
+        imperfect = rng.random() < operator.imperfect
+        self._grasp_m = operator.grasp_m * (2 if imperfect else 1)
+        angle_rad = rng.uniform(0, 2 * np.pi)
+        self._slip_m = SLIP_M * imperfect * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+
     def move(self, position_m: Point, yaw_rad: float, gripper: float) -> "_Plan":
         """Go straight to `position_m`; the number of steps follows from the distance."""
         distance_m = float(np.linalg.norm(np.subtract(position_m, self[-1].position_m)))
-        self.append(Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / SPEED_M))))
+        self.append(Waypoint(position_m, yaw_rad, gripper, max(MIN_STEPS, round(distance_m / self._speed_m))))
         return self
+
+    def descend(self, xy_m: tuple[float, float], height_m: float, yaw_rad: float, gripper: float) -> "_Plan":
+        """Come from above to a point near the table, with the operator's habits on the way."""
+        hover_m, (radius_m, bearing_rad) = HOVER_HEIGHT_M + self._operator.hover_m, _polar(*xy_m)
+        beside = [cartesian(radius_m, bearing_rad + m / radius_m) for m in (self._operator.side_m, WRONG_AIM_M)]
+        self.move((*beside[0], hover_m), yaw_rad, gripper)
+        if self._rng.random() < self._operator.hesitation:
+            self.append(replace(self[-1], steps=int(self._rng.integers(*PAUSE_STEPS, endpoint=True))))
+        if self._rng.random() < self._operator.correction:
+            self.move((*beside[1], WRONG_AIM_HEIGHT_M), yaw_rad, gripper).move((*xy_m, hover_m), yaw_rad, gripper)
+        return self.move((*xy_m, height_m), yaw_rad, gripper)
 
     def arc(self, end_xy_m: tuple[float, float], height_m: float, gripper: float) -> "_Plan":
         """Go along an arc around the base to `end_xy_m`, one waypoint per control step; the gripper turns along."""
@@ -143,7 +167,7 @@ class _Plan(list[Waypoint]):
         x, y, z = begin.position_m
         (radius_m, bearing_rad), (end_radius_m, end_bearing_rad) = _polar(x, y), _polar(*end_xy_m)
         turn_rad = end_bearing_rad - bearing_rad
-        steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / SPEED_M))
+        steps = max(MIN_STEPS, round(abs(turn_rad) * max(radius_m, end_radius_m) / self._speed_m))
         for progress in (_smooth(step / steps) for step in range(1, steps + 1)):
             point_m = cartesian(radius_m + progress * (end_radius_m - radius_m), bearing_rad + progress * turn_rad)
             position_m = (*point_m, z + progress * (height_m - z))
@@ -152,13 +176,15 @@ class _Plan(list[Waypoint]):
 
     def grasp(self, cube: Cube, height_m: float = GRASP_HEIGHT_M) -> "_Plan":
         """Hover over the cube, descend, close."""
-        around = _sidestep(*cube.xy_m, cube.yaw_rad)
-        self.move((*around, HOVER_HEIGHT_M), cube.yaw_rad, OPEN).move((*around, height_m), cube.yaw_rad, OPEN)
-        self.append(Waypoint((*cube.xy_m, height_m), cube.yaw_rad, CLOSED, CLOSE_STEPS))
+        along = self._grasp_m * np.array([np.cos(cube.yaw_rad), np.sin(cube.yaw_rad)])
+        x, y = np.add(cube.xy_m, along).tolist()
+        self.descend(_sidestep(x, y, cube.yaw_rad), height_m, cube.yaw_rad, OPEN)
+        self.append(Waypoint((x, y, height_m), cube.yaw_rad, CLOSED, CLOSE_STEPS))
         return self
 
     def carry(self, cube: Cube, to_xy_m: tuple[float, float], height_m: float) -> "_Plan":
         """Grasp the cube, carry it along an arc, set it down with the hand at `height_m`, release, rise."""
+        to_xy_m = tuple(np.add(to_xy_m, self._slip_m).tolist())
         self.grasp(cube).move((*cube.xy_m, CARRY_HEIGHT_M), cube.yaw_rad, CLOSED).arc(to_xy_m, CARRY_HEIGHT_M, CLOSED)
         yaw_rad = self[-1].yaw_rad
         around = _sidestep(*to_xy_m, yaw_rad)
@@ -174,7 +200,7 @@ class _Plan(list[Waypoint]):
         yaw_rad = beside_rad + np.pi / 2  # both finger tips at the same bearing
         beside = cartesian(cube_radius_m, beside_rad)
         end = cartesian(radius_m, bearing_rad - side * FORK_CONTACT_M / radius_m)
-        self.move((*beside, HOVER_HEIGHT_M), yaw_rad, FORK).move((*beside, PUSH_HEIGHT_M), yaw_rad, FORK)
+        self.descend(beside, PUSH_HEIGHT_M, yaw_rad, FORK)
         return self.arc(end, PUSH_HEIGHT_M, FORK)
 
     def point(self, xy_m: tuple[float, float]) -> "_Plan":
@@ -206,6 +232,13 @@ PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
     "stack": lambda plan, layout, cube: plan.carry(cube, layout.cubes[1].xy_m, STACK_HEIGHT_M),
     "sort": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
         layout.cubes[1], layout.zones_xy_m[1], GRASP_HEIGHT_M
+    ),
+    "pick": lambda plan, layout, cube: plan.grasp(cube).move((*cube.xy_m, LIFT_HEIGHT_M), cube.yaw_rad, CLOSED),
+    "square": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M),
+    "circle": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M),
+    "tower": lambda plan, layout, cube: plan.carry(cube, layout.cubes[1].xy_m, STACK_HEIGHT_M),
+    "pile": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
+        layout.cubes[1], layout.zones_xy_m[0], STACK_HEIGHT_M
     ),
     "reach": lambda plan, layout, cube: plan.move((*cube.xy_m, REACH_HEIGHT_M), cube.yaw_rad, OPEN),
     "grip": lambda plan, layout, cube: plan.grasp(cube),

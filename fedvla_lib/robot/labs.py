@@ -1,12 +1,14 @@
 """Labs: the differences between places that do the same tasks with the same kind of arm.
 
-Camera mounting, light, the colours of table and cubes, and the arm's calibration. Lengths are metres, angles degrees.
+Camera mounting, light, the colours of table and cubes, the arm's calibration, and who operates it (`operators`).
+Lengths are metres, angles degrees.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fedvla_lib.robot.operators import Operator, draw_operator
 from fedvla_lib.robot.spec import CAMERAS, NUM_JOINTS
 
 CAMERA_SHIFT_M, LOOK_SHIFT_M = 0.010, 0.006  # standard deviations of camera position and of its target point
@@ -29,17 +31,24 @@ class Lab:
     table_change: Vector = (0.0, 0.0, 0.0)  # added to red, green and blue in [0, 1]
     paint_change: Vector = (0.0, 0.0, 0.0)  # the same for the cubes
     joint_offset_deg: tuple[float, ...] = (0.0,) * (NUM_JOINTS - 1)  # reported minus true joint angle
+    operator: Operator = Operator()
 
 
 REFERENCE = Lab()
 
 
 def labs(count: int) -> list[Lab]:
-    """Return the reference lab and `count - 1` others; lab k depends on k only.
+    """Return the reference lab and `count - 1` others, each with an operator of its own; lab k depends on k only.
 
     So a recording and later runs, whatever their seed, use the same labs.
     """
-    return [REFERENCE, *(draw_lab(f"lab_{k}", np.random.default_rng([0, k])) for k in range(1, count))]
+    return [REFERENCE, *(_with_operator(k) for k in range(1, count))]
+
+
+def _with_operator(k: int) -> Lab:
+    rng = np.random.default_rng([0, k])
+    lab = draw_lab(f"lab_{k}", rng)
+    return replace(lab, operator=draw_operator(rng))
 
 
 def draw_lab(name: str, rng: np.random.Generator, spread: float = 1.0, offsets: bool = True) -> Lab:

@@ -7,10 +7,11 @@ the table under the arm's first joint, x points away from the base, y to the arm
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fedvla_lib.robot import layout
 from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, Layout, Patch, Region, draw_cubes, draw_zones
 
 LIFT_CLEARANCE_M = 0.04  # a held cube higher above the table than this is lifted
@@ -21,6 +22,7 @@ REST_SPEED_MPS = 0.02  # below this the cube is at rest
 AWAY_M = 0.04  # minimum distance from grasp point to cube once the cube is released
 PLACE_HALF_M = 0.040  # half the side of the square
 PUSH_RADIUS_M = 0.045  # radius of the circle
+LAB_HALF_M, LAB_RADIUS_M = 0.052, 0.057  # the same of the ten labs' square and circle
 REACH_M = 0.012  # maximum horizontal distance from grasp point to cube centre
 REACH_HEIGHT_M = (0.020, 0.050)  # range of the vertical distance
 POINT_M = 0.020  # maximum horizontal distance from grasp point to zone centre
@@ -62,10 +64,17 @@ class Task:
     other: Region | None = None  # where a second cube of another colour stands
     other_share: float = 1.0  # fraction of episodes with the second cube
     zones: tuple[Patch, ...] = ()
+    # Minimum distance between centres: of cubes, of zones, of a cube and a zone.
+    apart_m: tuple[float, float, float] = (layout.CUBES_APART_M, layout.ZONES_APART_M, 0.0)
 
 
-def _placed(state: TaskState) -> bool:
-    inside = max(abs(offset) for offset in state.zone_offset_m) < PLACE_HALF_M - CUBE_HALF_M
+def _placed(state: TaskState, half_m: float = PLACE_HALF_M) -> bool:
+    inside = max(abs(offset) for offset in state.zone_offset_m) < half_m - CUBE_HALF_M
+    return state.carried and inside and _released(state) and _at_rest(state)
+
+
+def _circled(state: TaskState) -> bool:
+    inside = float(np.hypot(*state.zone_offset_m)) < LAB_RADIUS_M - CUBE_HALF_M
     return state.carried and inside and _released(state) and _at_rest(state)
 
 
@@ -80,6 +89,12 @@ def _stacked(state: TaskState) -> bool:
     on_top = np.hypot(x, y) < CUBE_HALF_M and abs(z - 2 * CUBE_HALF_M) < REST_CLEARANCE_M
     still = state.speed_mps < REST_SPEED_MPS and _at_rest(below) and not below.touched
     return bool(state.carried and on_top and _released(state) and still)
+
+
+def _piled(state: TaskState) -> bool:
+    (upper,) = state.others
+    inside = max(abs(offset) for offset in state.zone_offset_m) < LAB_HALF_M - CUBE_HALF_M
+    return inside and state.carried and _stacked(replace(upper, others=(state,)))
 
 
 def _reached(state: TaskState) -> bool:
@@ -143,6 +158,24 @@ TASKS = _by_name(
                 Patch(Region((0.19, 0.21), (-46.0, -36.0)), "disc", PUSH_RADIUS_M))),
 )  # fmt: skip
 
+# The five tasks of the benchmark "ten labs": in each two cubes, a square and a circle anywhere on the table, so that
+# only the instruction tells which cube goes where; *pile* takes two steps.
+_CUBES = Region((0.185, 0.23), (-28.0, 28.0))
+_ZONES = Region((0.185, 0.225), (-42.0, 42.0))
+_SQUARE, _CIRCLE = Patch(_ZONES, "square", LAB_HALF_M), Patch(_ZONES, "disc", LAB_RADIUS_M)
+_LAB = {"cube": _CUBES, "other": _CUBES, "zones": (_SQUARE, _CIRCLE), "apart_m": (0.08, 0.11, 0.065)}
+LAB_TASKS = _by_name(
+    Task("pick", ("Pick up the {color} cube.",), TASKS["lift"].success, hold_steps=5, horizon_steps=75, **_LAB),
+    Task("square", ("Move the {color} cube to the yellow square.",), lambda state: _placed(state, LAB_HALF_M),
+         hold_steps=4, horizon_steps=120, **_LAB),
+    Task("circle", ("Move the {color} cube to the white circle.",), _circled, hold_steps=4, horizon_steps=120,
+         **_LAB | {"zones": (_CIRCLE, _SQUARE)}),
+    Task("tower", ("Put the {color} cube on top of the {other} cube.",), _stacked, hold_steps=4, horizon_steps=120,
+         **_LAB),
+    Task("pile", ("Move the {color} cube to the yellow square, then put the {other} cube on top of it.",), _piled,
+         hold_steps=4, horizon_steps=230, **_LAB),
+)  # fmt: skip
+
 ANYWHERE = Region((0.185, 0.23), (-30.0, 30.0))
 ON_THE_LEFT = Region((0.185, 0.23), (-8.0, 34.0))  # for tasks that move the cube to the right
 FAR = Region((0.205, 0.235), (-30.0, 30.0))
@@ -169,7 +202,7 @@ PRETRAINING_TASKS = _by_name(
          _pointed, hold_steps=4, horizon_steps=60, cube=ANYWHERE,
          zones=(ZONES_ANYWHERE["disc"], ZONES_ANYWHERE["square"])),
 )  # fmt: skip
-ALL_TASKS = TASKS | PRETRAINING_TASKS
+ALL_TASKS = TASKS | LAB_TASKS | PRETRAINING_TASKS
 
 
 def task_of(text: str) -> str:
@@ -205,6 +238,10 @@ def draw_layout(task: Task, rng: np.random.Generator, color: str | None = None) 
     drawn = [str(name) for name in rng.permutation(list(COLORS))]
     colors = sorted(drawn, key=lambda name: name != color)  # stable: the others stay in the order drawn
     regions = [task.cube, *([task.other] if task.other and rng.random() < task.other_share else [])]
-    cubes, zones_xy_m = draw_cubes(regions, colors, rng), draw_zones(task.zones, rng)
+    cubes_m, zones_m, between_m = task.apart_m
+    while True:
+        cubes, zones_xy_m = draw_cubes(regions, colors, rng, cubes_m), draw_zones(task.zones, rng, zones_m)
+        if all(np.hypot(*np.subtract(cube.xy_m, zone)) >= between_m for cube in cubes for zone in zones_xy_m):
+            break
     wording = task.wordings[rng.integers(len(task.wordings))]
     return Layout(wording.format(color=colors[0], other=colors[1]), cubes, zones_xy_m)

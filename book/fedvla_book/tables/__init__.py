@@ -16,23 +16,19 @@ from fedvla_book.tables.grids import (
     paired_difference,
     read_rounds,
     repeat_partition_free,
-    unpaired_difference,
 )
 from fedvla_book.tables.model import adapters, averaging_error, learning_rates, module_table
-from fedvla_book.tables.searches import SEARCHED, compared, read_searches
 
 __all__ = [
     "crossed_bootstrap",
     "paired",
     "paired_difference",
-    "SEARCHED",
     "adapters",
     "at_own_task",
     "averaging_error",
     "beside_own_tasks",
     "by_steps",
     "clear_pairs",
-    "compared",
     "correlations",
     "differences",
     "disagreements",
@@ -41,7 +37,5 @@ __all__ = [
     "learning_rates",
     "module_table",
     "read_rounds",
-    "read_searches",
     "repeat_partition_free",
-    "unpaired_difference",
 ]

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from statsmodels.stats.proportion import confint_proportions_2indep
 
 from fedvla_lib import run_folder
 from fedvla_lib.evaluation import statistics
@@ -102,19 +101,6 @@ def _held_out(rows: pd.DataFrame, method: str, other: str) -> dict[str, float]:
         over = statistics.over_seeds((each[method] - each[other]).to_frame())
         found |= {name: over["difference"], f"{name}_low": over["low"], f"{name}_high": over["high"]}
     return found
-
-
-def unpaired_difference(
-    left: tuple[int, int], right: tuple[int, int], confidence: float = CONFIDENCE
-) -> tuple[float, float]:
-    """Interval of left - right, two success rates of which only (successes, rollouts) are known.
-
-    If both made the same rollouts, `paired_difference` is usually narrower, but needs the outcome of each.
-
-    Source: Newcombe 1998, Statistics in Medicine 17, 873-890, method 10 (combines Wilson's intervals).
-    """
-    low, high = confint_proportions_2indep(*left, *right, method="newcomb", alpha=1 - confidence)
-    return float(low), float(high)
 
 
 def at_own_task(rows: pd.DataFrame) -> pd.Series:
