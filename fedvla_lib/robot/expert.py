@@ -37,7 +37,7 @@ SIDESTEP_M = 0.009  # offset of the open jaws towards the fixed jaw, so that nei
 CLOSE_STEPS = OPEN_STEPS = 4
 PAUSE_STEPS = (2, 6)  # shortest and longest pause of an operator who hesitates
 WRONG_AIM_M, WRONG_AIM_HEIGHT_M = 0.016, 0.050  # where a descent that will be corrected aims, beside the cube
-SLIP_M = 0.006  # how far from the goal an imperfect demonstration releases the cube; its grasp is off twice as far
+SLIP_M = 0.006  # how far off the goal an imperfect demonstration releases the cube; its grasp offset is doubled
 MIN_STEPS = 4
 SPEED_M = 0.011  # mean distance per control step
 SOLVER_STEPS = 60  # maximum inverse kinematics iterations per control step
