@@ -166,15 +166,13 @@ def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
     return pd.DataFrame([{**e["values"], **{key: e[key] for key in fixed}} for e in events], columns=fixed + named)
 
 
-def counted_steps(root: Path) -> dict[str, int] | None:
+def counted_steps(root: Path) -> dict[str, int]:
     """Return the gradient steps that went into a federated run's global model, as counted by its clients.
 
     ``in_all`` sums over all averaged replies; ``in_a_row`` sums the largest count of each round, since the clients of a
-    round train in parallel. None for a run of an older version, whose replies lack counts.
+    round train in parallel.
     """
     trained = read_metrics(root, "train")
-    if "steps" not in trained or trained.steps.isna().any():
-        return None
     return {"in_all": int(trained.steps.sum()), "in_a_row": int(trained.groupby("round").steps.max().sum())}
 
 

@@ -15,7 +15,7 @@ import front_page
 import pages
 from execution import BookError, Chapter
 from fedvla_book import tables
-from fedvla_lib.experiments import results
+from fedvla_book.tables import results
 
 ROOT = Path(__file__).parent.parent
 CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from fedvla_book.tables import grids
+from fedvla_book.tables import grids, intervals
 from fedvla_lib.evaluation import statistics
 
 pytestmark = pytest.mark.unit
@@ -139,13 +139,13 @@ def test_a_p_value_is_never_printed_as_zero():
 def test_the_smallest_visible_difference_is_seen_about_four_times_in_five():
     """Pairs drawn with just that difference are found significant with the power that was asked for."""
     n, discordant = 200, 0.3
-    d = statistics.smallest_difference(n, discordant)
+    d = intervals.smallest_difference(n, discordant)
     rng = np.random.default_rng(0)
     pairs = rng.choice(3, size=(2000, n), p=[(discordant + d) / 2, (discordant - d) / 2, 1 - discordant])
     only_left, only_right = (pairs == 0).sum(axis=1), (pairs == 1).sum(axis=1)
     statistic = (only_left - only_right) / np.sqrt(np.maximum(only_left + only_right, 1))
     assert np.mean(np.abs(statistic) > 1.96) == pytest.approx(0.8, abs=0.03)
-    assert np.isnan(statistics.smallest_difference(5, 0.1))  # five pairs, half a disagreement: nothing can be seen
+    assert np.isnan(intervals.smallest_difference(5, 0.1))  # five pairs, half a disagreement: nothing can be seen
 
 
 @pytest.mark.parametrize("n", [39, 60, 300])
@@ -174,7 +174,7 @@ def outcomes(values, tasks=2):
 
 def test_with_one_rollout_a_seed_the_interval_is_students():
     each = np.array([0.1, 0.4, 0.3, 0.25, 0.6])
-    found = statistics.over_seeds(outcomes(each[:, None], tasks=1))
+    found = intervals.over_seeds(outcomes(each[:, None], tasks=1))
     expected = stats.ttest_1samp(each, 0)
     assert found["p_value"] == pytest.approx(expected.pvalue) and found["df"] == 4
     assert (found["low"], found["high"]) == pytest.approx(tuple(expected.confidence_interval()))
@@ -182,7 +182,7 @@ def test_with_one_rollout_a_seed_the_interval_is_students():
 
 def test_the_parts_of_the_variance_are_those_of_a_case_worked_out_by_hand():
     # Four seeds, two rollouts at one task: seeds are off the mean by 0.5, 0.5, 0 and 0, rollouts by 0.
-    found = statistics.over_seeds(outcomes([[1, 1], [0, 0], [1, 0], [0, 1]], tasks=1))
+    found = intervals.over_seeds(outcomes([[1, 1], [0, 0], [1, 0], [0, 1]], tasks=1))
     # Sums of squares: seeds 2 (0.25 + 0.25), rollouts 0, rest 4 x 0.25. Mean squares: 1/3, 0, 1/3.
     # Their sum MS_seeds + MS_rollouts - MS_rest is 0, so half the rest counts, with the seeds' degrees of freedom.
     reach = stats.t.ppf(0.975, 3) * sqrt(1 / 6 / 8)
@@ -191,7 +191,7 @@ def test_the_parts_of_the_variance_are_those_of_a_case_worked_out_by_hand():
 
 def test_several_rollouts_need_several_training_seeds():
     with pytest.raises(ValueError, match="at least 2"):
-        statistics.over_seeds(outcomes([[1, 0, 1, 1]]))
+        intervals.over_seeds(outcomes([[1, 0, 1, 1]]))
 
 
 @pytest.mark.parametrize(
@@ -214,9 +214,9 @@ def test_intervals_over_seeds_and_rollouts_cover_the_truth_as_often_as_they_say(
             for shift in (0.0, 0.3)
         )
         difference = pd.DataFrame(left.astype(float) - right, columns=columns)
-        found = statistics.over_seeds(difference)
+        found = intervals.over_seeds(difference)
         covered["difference"].append(found["low"] <= rates[0] - rates[1] <= found["high"])
-        found = statistics.over_seeds(pd.DataFrame(left.astype(float), columns=columns))
+        found = intervals.over_seeds(pd.DataFrame(left.astype(float), columns=columns))
         covered["rate"].append(found["low"] <= rates[0] <= found["high"])
         if k % 4 == 0:
             low, high = grids.crossed_bootstrap(difference, seed=k, resamples=400)
@@ -240,9 +240,9 @@ def test_methods_are_paired_by_training_seed_and_rollout():
     with pytest.raises(ValueError, match="cannot be paired"):
         grids.difference_over_seeds(table.drop(index=[3, 7]), "a", "b", seed=0)
     with pytest.raises(ValueError, match="lack rollouts"):
-        statistics.by_run(table[table.method == "a"].drop(index=3))
+        intervals.by_run(table[table.method == "a"].drop(index=3))
     with pytest.raises(ValueError, match="twice"):
-        statistics.by_run(table)
+        intervals.by_run(table)
 
 
 def test_the_crossed_bootstrap_is_as_wide_as_the_spread_of_seeds_when_only_they_differ():
@@ -265,5 +265,5 @@ def test_the_order_in_which_rollouts_were_made_does_not_matter():
 @pytest.mark.parametrize("ending", [False, True])
 def test_rollouts_that_all_end_alike_leave_room_for_doubt(ending):
     rows = [{"run": run, "task": "lift", "seed": seed, "success": ending} for run in (0, 1) for seed in range(30)]
-    low, high = statistics.success_interval(pd.DataFrame(rows))
+    low, high = intervals.success_interval(pd.DataFrame(rows))
     assert (low, high) == pytest.approx(statistics.wilson(30 * ending, 30)) and high - low > 0.05

@@ -69,16 +69,10 @@ def test_runs_are_compared_rollout_by_rollout_and_episode_by_episode(runs, tmp_p
     assert json.loads((tmp_path / "comparison.json").read_text())["mismatches"] == []
 
 
-def test_steps_are_those_that_clients_counted_and_follow_from_the_settings_only_in_runs_that_did_not(runs, tmp_path):
+def test_steps_are_those_that_clients_counted(runs, tmp_path):
     assert compare_runs.read_run(runs["longer"]).gradient_steps == 6
     more = copied(runs["longer"], tmp_path / "more", kind="train", name="steps", change=lambda steps: steps + 1)
     assert compare_runs.read_run(more).gradient_steps == 8
-    older = copied(runs["longer"], tmp_path / "older", settings={"local_steps": 5})
-    events = run_folder.read_events(older)
-    for event in events:
-        event["values"].pop("steps" if event["kind"] == "train" else "", None)
-    (older / "metrics.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
-    assert compare_runs.read_run(older).gradient_steps == 10
 
 
 def test_averages_over_episodes_are_those_of_the_round(runs):

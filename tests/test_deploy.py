@@ -135,7 +135,7 @@ def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tm
 
 
 def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deployment_too(standing, tiny, faulty):
-    deployment.submit(standing, tiny, 540)
+    standing.run(tiny, 540)
     assert_faults_were_survived(max(run_folder.run_folders(tiny)), tiny)
 
 
@@ -167,7 +167,7 @@ def test_a_round_goes_on_without_a_killed_node_and_a_later_one_has_it_back(stand
             happened.append("started again")
             start_again(standing, 1)
 
-    deployment.submit(standing, config, 900, meddle)
+    standing.run(config, 900, meddle)
     root = max(run_folder.run_folders(config))
     assert happened == ["killed", "started again"] and run_folder.read_stamp(root)["status"] == "completed"
     rejected, trained, counted = (run_folder.read_metrics(root, kind) for kind in ("rejected", "train", "replies"))
@@ -213,7 +213,7 @@ def test_a_deployment_goes_on_when_its_fork_servers_are_killed(standing, tiny):
     servers = [one for one in psutil.Process().children() if str(FORK_SERVER) in one.cmdline()]
     for server in servers:
         server.kill()
-    deployment.submit(standing, replace(tiny, num_server_rounds=1), 540)
+    standing.run(replace(tiny, num_server_rounds=1), 540)
     assert servers and len(run_folder.read_metrics(max(run_folder.run_folders(tiny)), "train")) == 2
 
 

@@ -69,7 +69,7 @@ def test_a_base_can_be_moved_and_names_no_place_of_the_machine_that_made_it(made
     made.rename(moved)
     try:
         bundle = model.load_policy(from_profile("tiny", base=str(moved)))
-        assert bundle.policy.config.vlm_model_name == str((moved / model.VLM_FOLDER).resolve())
+        assert bundle.policy.config.vlm_model_name == str((moved / nano.VLM_FOLDER).resolve())
     finally:
         moved.rename(made)
 

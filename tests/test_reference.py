@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from fedvla_book.tables import results
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
-from fedvla_lib.experiments import methods, results
+from fedvla_lib.experiments import methods
 from fedvla_lib.experiments.experiment_file import read_plan
 
 pytestmark = pytest.mark.unit

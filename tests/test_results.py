@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from fedvla_book import tables
+from fedvla_book.tables import results
 from fedvla_lib.data import partition as partition_module
-from fedvla_lib.experiments import results
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[1]

@@ -8,12 +8,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from fedvla_book.tables import results
 from fedvla_lib import run_folder
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation, record
 from fedvla_lib.engines import inline
 from fedvla_lib.evaluation import rollouts
-from fedvla_lib.experiments import experiment, results
+from fedvla_lib.experiments import experiment
 from fedvla_lib.experiments.experiment_file import read_plan
 from fedvla_lib.federation import checkpoint, client_app
 from fedvla_lib.policy import model

@@ -10,8 +10,8 @@ import pandas as pd
 
 from execution import BookError
 from fedvla_book import plots, tables
-from fedvla_lib.evaluation import figures, statistics
-from fedvla_lib.experiments import results
+from fedvla_book.tables import intervals, results
+from fedvla_lib.evaluation import figures
 
 VIDEO_CHAPTER = "05_evaluation_videos"
 COMPARISON = "book/reference/comparison"
@@ -165,7 +165,7 @@ def _rate_of(found: pd.Series) -> str:
 
 
 def _rate(rows: pd.DataFrame) -> str:
-    return f"{_percent(rows.success.mean(), *statistics.success_interval(rows))} over {len(rows):,} rollouts"
+    return f"{_percent(rows.success.mean(), *intervals.success_interval(rows))} over {len(rows):,} rollouts"
 
 
 def _percent(rate: float, low: float, high: float) -> str:

@@ -188,14 +188,28 @@ def _print_rounds(folder: Path) -> None:
 
 
 def experiment(options: argparse.Namespace) -> None:
-    """Run the unfinished cells of an experiment and print the summary."""
+    """Run the unfinished cells of an experiment and print what each cell reached and cost."""
+    import pandas as pd
+
     from fedvla_lib.experiments.experiment import run_plan
     from fedvla_lib.experiments.experiment_file import read_plan
-    from fedvla_lib.experiments.results import read_results, summary
 
     plan = read_plan(options.file)
     run_plan(plan, options.out, jobs=_jobs(options, next((cell.config.device for cell in plan.cells), "cpu")))
-    print(summary(read_results(options.out)).round(3).to_string(index=False))
+    _print_table(pd.DataFrame([_of_cell(options.out / cell.name) for cell in plan.cells]))
+
+
+def _of_cell(folder: Path) -> dict[str, Any]:
+    """Return how often the last model of a finished cell succeeded, and what its training cost."""
+    from fedvla_lib.evaluation.statistics import mean_with_interval
+    from fedvla_lib.run_folder import read_metrics, read_stamp
+
+    stamp, rows = read_stamp(folder), read_metrics(folder, "rollout")
+    success = rows.success[rows["round"] == rows["round"].max()].to_numpy(float)
+    found = mean_with_interval(success, of_success=True, seed=0)
+    costs = {name: stamp[name] for name in ("gradient_steps", "samples", "train_s")}
+    names = {name: stamp[name] for name in ("partition", "method", "seed")}
+    return {**names, **found, **costs, "MB": stamp["bytes"] / 1e6}
 
 
 def _jobs(options: argparse.Namespace, device: str) -> int:

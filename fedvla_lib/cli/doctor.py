@@ -7,12 +7,10 @@ when one of them is broken. It does not know torch, LeRobot or Flower beyond the
 
 import importlib.metadata
 import os
-import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-import urllib.request
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +19,8 @@ from packaging.requirements import Requirement
 
 from fedvla_lib.files import cache_dir
 
-MIN_PYTHON = (3, 12)
 MIN_FREE_GIB = 2.0  # recordings, decoded frames, run folders and pages of all chapters, laptop profile
-MIN_MEMORY_GIB = 4.0  # the largest chapter, laptop profile, and a browser
 RENDER_TIMEOUT_S = 120  # the first off-screen context after a boot takes tens of seconds
-HUB_TIMEOUT_S = 3.0
 CODEC = "h264"  # of recorded camera images and of the videos in the pages
 MAX_PIXEL_ERROR = 12.0  # mean absolute error of a decoded test frame, out of 255; H.264 stays below 5
 APT_RENDERING = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
@@ -55,14 +50,6 @@ class Check:
     found: str
     fix: str = ""
     required: bool = True  # a chapter cannot run without it; otherwise a failure is only a note
-
-
-def check_interpreter(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
-    """Check the Python version."""
-    wanted, found = (".".join(map(str, one)) for one in (MIN_PYTHON, version))
-    fix = f"install Python {wanted}, or let uv install it: rm -r .venv && make env"
-    ok = tuple(version[:2]) >= MIN_PYTHON
-    return Check("interpreter", ok, f"Python {found} on {platform.platform(terse=True)}", fix)
 
 
 def check_packages(requirements: Iterable[str] | None = None) -> Check:
@@ -168,35 +155,12 @@ def check_cache(folder: Path) -> Check:
     return Check("cache", True, f"{folder} is writable")
 
 
-def check_memory(min_gib: float = MIN_MEMORY_GIB) -> Check:
-    """Check the memory of the machine."""
-    total_gib = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
-    fix = "close other programs, or use FEDVLA_PROFILE=tiny"
-    return Check("memory", total_gib >= min_gib, f"{total_gib:.1f} GiB", fix, required=False)
-
-
-def check_hub(timeout_s: float = HUB_TIMEOUT_S) -> Check:
-    """Check whether the Hugging Face Hub answers; only the gpu profile and data sets on the hub need it."""
-    is_off = os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}
-    offline = " (HF_HUB_OFFLINE=1 keeps the libraries offline)" if is_off else ""
-    fix = "only needed for the gpu profile and data sets on the hub: connect, then export HF_HUB_OFFLINE=0"
-    try:
-        from huggingface_hub.constants import ENDPOINT
-
-        with urllib.request.urlopen(urllib.request.Request(ENDPOINT, method="HEAD"), timeout=timeout_s):
-            return Check("hub", True, f"answers{offline}", fix, required=False)
-    except urllib.error.HTTPError as error:
-        return Check("hub", True, f"answers with status {error.code}{offline}", fix, required=False)
-    except (ImportError, OSError) as error:
-        return Check("hub", False, f"no answer: {getattr(error, 'reason', error)}{offline}", fix, required=False)
-
-
 def examine(folder: Path | None = None) -> list[Check]:
     """Run all checks; `folder` (default: the cache folder) is where recordings are kept."""
     folder = folder or cache_dir()
     lock = Path(__file__).parents[2] / "requirements.lock"
-    checks = [check_interpreter(), check_packages(), check_lock(lock), check_rendering(), check_video()]
-    return [*checks, check_cache(folder), check_disk(folder), check_memory(), check_hub()]
+    checks = [check_packages(), check_lock(lock), check_rendering(), check_video()]
+    return [*checks, check_cache(folder), check_disk(folder)]
 
 
 def can_run(checks: Iterable[Check]) -> bool:

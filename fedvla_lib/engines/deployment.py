@@ -64,6 +64,11 @@ class Deployment:
         if not _says(log, CONNECTED):  # it would retry forever
             raise FlowerRunError(f"{who} does not trust the SuperLink; {processes.reason(log)}")
 
+    def run(self, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
+        """Run the app and wait until it ends; raise FlowerRunError if it failed or timed out."""
+        app = app_bundle.stage_app(self.folder, config)
+        superlink.require_completed(self.link, self.link.submit(app, timeout_s=timeout_s, watch=watch))
+
     def kill_nodes(self) -> None:
         """Kill the SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
         for node in self.nodes.values():
@@ -138,19 +143,8 @@ def run_deployed(
         folder = Path(name)
         with running_deployment(folder, config.num_clients, tls=tls, auth=auth, data=data) as deployment:
             say(f"{config.num_clients} SuperNodes joined the SuperLink at 127.0.0.1:{deployment.link.port}")
-            submit(deployment, config, timeout_s, progress_reporter(config, before, say))
+            deployment.run(config, timeout_s, progress_reporter(config, before, say))
     return run_folder.own_run(config, before)
-
-
-def submit(deployment: Deployment, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
-    """Run the app on a deployment and wait until it ends.
-
-    Raises:
-        FlowerRunError: the run failed or timed out.
-    """
-    app = app_bundle.stage_app(deployment.folder, config)
-    run_id = deployment.link.submit(app, timeout_s=timeout_s, watch=watch)
-    superlink.require_completed(deployment.link, run_id)
 
 
 def progress_reporter(config: Config, before: set[Path], say: Callable[[str], None]) -> Callable[[], None]:

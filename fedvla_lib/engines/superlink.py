@@ -52,12 +52,16 @@ class SuperLink:
             FlowerRunError: the run was not accepted or timed out.
         """
         command = ["flwr", "run", str(app), self.connection, *options, "--stream"]
+        deadline = time.monotonic() + timeout_s
         with open(self.log, "wb") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=subprocess.STDOUT)
             try:
-                _follow(process, timeout_s, watch)
-            except subprocess.TimeoutExpired as error:
-                raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {reason(self.log)}") from error
+                while process.poll() is None:
+                    if time.monotonic() > deadline:
+                        raise FlowerRunError(f"the run did not end within {timeout_s:.0f} s: {reason(self.log)}")
+                    watch()
+                    time.sleep(POLL_S)
+                watch()
             finally:
                 process.kill()
         accepted = re.search(r"Successfully started run (\d+)", self.log.read_text(errors="replace"))
@@ -155,16 +159,3 @@ def answers(port: int, files: ServerFiles | None = None) -> bool:
             return response.status == 200
     except OSError:
         return False
-
-
-def _follow(process: subprocess.Popen, timeout_s: float, watch: Callable[[], None]) -> None:
-    """Wait for a process, calling `watch` every second and once at the end."""
-    deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            process.wait(min(1.0, max(0.0, deadline - time.monotonic())))
-            return watch()
-        except subprocess.TimeoutExpired:
-            watch()
-            if time.monotonic() > deadline:
-                raise

@@ -47,7 +47,7 @@ def read_run(folder: Path) -> Run:
         raise ValueError(f"{folder} measured no held-out episode: let the run end, with val-fraction above 0")
     rollouts, columns = _last(run_folder.read_metrics(folder, "rollout")), [*ROLLOUT_KEY, "success"]
     rollouts = rollouts[columns] if len(rollouts) else pd.DataFrame(columns=columns)
-    return Run(folder.name, config, _gradient_steps(folder, config), held_out.set_index("episode_id"), rollouts)
+    return Run(folder.name, config, _gradient_steps(folder), held_out.set_index("episode_id"), rollouts)
 
 
 def _last(rows: pd.DataFrame) -> pd.DataFrame:
@@ -55,17 +55,12 @@ def _last(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["round"] == rows["round"].max()]
 
 
-def _gradient_steps(folder: Path, config: Config) -> int:
-    """Gradient steps as counted while training.
-
-    Runs from before clients counted their steps: local steps times the number of averaged replies.
-    """
+def _gradient_steps(folder: Path) -> int:
+    """Gradient steps as counted while training."""
     evaluated = run_folder.read_metrics(folder, "evaluate")
     if "gradient_steps" in evaluated:
         return int(evaluated.gradient_steps.dropna().iloc[-1])
-    if counted := run_folder.counted_steps(folder):
-        return counted["in_all"]
-    return len(run_folder.read_metrics(folder, "train")) * config.local_steps
+    return run_folder.counted_steps(folder)["in_all"]
 
 
 def mismatches(runs: Sequence[Run], metrics: Sequence[str]) -> list[str]:

@@ -27,13 +27,12 @@ from fedvla_lib.data.normalisation import Stats
 from fedvla_lib.files import new_folder
 from fedvla_lib.policy import lean_expert
 from fedvla_lib.policy.lora import add_adapters, merged
-from fedvla_lib.policy.nano import NANO, NANO_RANDOM, WEIGHTS_FILE, ensure_nano, nano_base
+from fedvla_lib.policy.nano import NANO, NANO_RANDOM, VLM_FOLDER, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
 
 POSITION_STD = 0.3  # standard deviation of the nano vision encoder's initial position embeddings
 SMALL = 50_000_000  # parameters below which one thread is used; the nano policy has 2.4 million, SmolVLA 450
-VLM_FOLDER = "vlm"  # a saved nano policy includes its backbone's config and tokenizer, so the folder can be moved
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def _check(recipe: Recipe) -> None:
 def _make_backbone_relative(folder: Path, backbone: str) -> None:
     """Replace the absolute path of the backbone in the saved files by its folder beside them."""
     for path in sorted(folder.glob("*.json")):
-        path.write_text(path.read_text().replace(json.dumps(backbone), json.dumps(model.VLM_FOLDER)))
+        path.write_text(path.read_text().replace(json.dumps(backbone), json.dumps(nano.VLM_FOLDER)))
 
 
 def measure(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list[dict[str, Any]]:

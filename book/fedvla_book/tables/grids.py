@@ -1,16 +1,17 @@
 """Tables of stored grids: differences between methods, rounds, local-only clients next to the federation."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from fedvla_book.tables import intervals
+from fedvla_book.tables.results import HELD_OUT, LOCAL_ONLY, cell_columns, cell_folders
 from fedvla_lib import run_folder
 from fedvla_lib.evaluation import statistics
 from fedvla_lib.evaluation.statistics import CONFIDENCE, P_VALUES
-from fedvla_lib.experiments.results import HELD_OUT, LOCAL_ONLY, cell_columns, cell_folders
 
 OF_RUN = ("partition", "method", "run")
 PARTITION_FREE = ("base", "centralized")  # kinds that do not depend on the partition of a recording
@@ -98,7 +99,7 @@ def _held_out(rows: pd.DataFrame, method: str, other: str) -> dict[str, float]:
     found = {}
     for name in HELD_OUT:
         each = rows.groupby(["method", "run"])[name].first()
-        over = statistics.over_seeds((each[method] - each[other]).to_frame())
+        over = intervals.over_seeds((each[method] - each[other]).to_frame())
         found |= {name: over["difference"], f"{name}_low": over["low"], f"{name}_high": over["high"]}
     return found
 
@@ -161,7 +162,7 @@ def beside_own_tasks(rows: pd.DataFrame, method: str, other: str, *, seed: int) 
     difference = paired_difference if seeds == 1 else difference_over_seeds
     found = {"seeds": seeds, **difference(both, method, other, seed=seed)}
     for name, part in (("success", own), ("other", same)):
-        low, high = statistics.success_interval(part)
+        low, high = intervals.success_interval(part)
         found |= {f"{name}_rate": float(part.success.mean()), f"{name}_low": low, f"{name}_high": high}
     return found
 
@@ -212,14 +213,14 @@ def difference_over_seeds(
     Raises:
         ValueError: the methods do not have the same training seeds and rollouts.
     """
-    left, right = (statistics.by_run(rows[rows.method == name]) for name in (method, other))
+    left, right = (intervals.by_run(rows[rows.method == name]) for name in (method, other))
     if not (left.index.equals(right.index) and left.columns.equals(right.columns)):
         raise ValueError(f"{method!r} and {other!r} differ in training seeds or rollouts: they cannot be paired")
     outcomes = (one.to_numpy().ravel() for one in (left, right))
     pairs = statistics.success_difference(*outcomes, seed=seed, confidence=confidence)
     low, high = crossed_bootstrap(left - right, seed=seed, confidence=confidence)
     counts = {key: pairs[key] for key in ("n", "only_left", "only_right")}
-    found = statistics.over_seeds(left - right, confidence)
+    found = intervals.over_seeds(left - right, confidence)
     p_values = {"p_value": found.pop("p_value"), "mcnemar_p": pairs["p_value"]}
     return {"method": method, "other": other, **found, "boot_low": low, "boot_high": high, **counts, **p_values}
 
@@ -234,14 +235,23 @@ def crossed_bootstrap(
 
     Source: the pigeonhole bootstrap, Owen 2007, doi 10.1214/07-AOAS122.
     """
-    rng, array = np.random.default_rng(seed), values.to_numpy(float)
-    seeds, rollouts = array.shape
+    means = resampled_means([values], seed=seed, resamples=resamples)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def resampled_means(tables: Sequence[pd.DataFrame], *, seed: int, resamples: int = 2000) -> np.ndarray:
+    """Return the means of tables, (resamples, tables), with training seeds and rollouts resampled alike in all.
+
+    Args:
+        tables: each with a row for each training seed and a column for each rollout (task, seed), the same in all.
+    """
+    rng, arrays = np.random.default_rng(seed), [table.to_numpy(float) for table in tables]
+    seeds, rollouts = arrays[0].shape
     rows = rng.multinomial(seeds, np.full(seeds, 1 / seeds), resamples)
-    tasks = np.asarray(values.columns.get_level_values(0))
+    tasks = np.asarray(tables[0].columns.get_level_values(0))
     columns = np.zeros((resamples, rollouts), dtype=int)
     for task in np.unique(tasks):
         places = np.flatnonzero(tasks == task)
         columns[:, places] = rng.multinomial(len(places), np.full(len(places), 1 / len(places)), resamples)
-    means = np.einsum("rs,sa,ra->r", rows, array, columns, optimize=True) / array.size
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(low), float(high)
+    return np.stack([np.einsum("rs,sa,ra->r", rows, a, columns, optimize=True) / a.size for a in arrays], axis=1)

@@ -37,7 +37,7 @@ def module_table(policy: "SmolVLAPolicy") -> list[dict[str, Any]]:
 
 def learning_rates(bundle: "Bundle", config: Config, *, steps: int) -> list[float]:
     """Return the learning rate of each of `steps` gradient steps."""
-    from fedvla_lib.policy.training import adamw  # loads torch
+    from fedvla_lib.policy.optimizers import adamw  # loads torch
 
     _, scheduler = adamw(bundle, config, 0, steps)
     return [config.lr * scheduler.lr_lambdas[0](step) for step in range(steps)]

@@ -6,9 +6,9 @@ from typing import Any
 
 import pandas as pd
 
+from fedvla_book.tables.intervals import success_interval
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
-from fedvla_lib.evaluation import statistics
 from fedvla_lib.run_folder import GLOBAL
 
 OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
@@ -85,7 +85,7 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> 
     lines = []
     for group, part in rows.groupby(list(by), sort=False):
         cells = part.groupby("run").first()
-        low, high = statistics.success_interval(part)
+        low, high = success_interval(part)
         lines.append({
             **dict(zip(by, group, strict=True)), "seeds": len(cells), "rollouts": len(part),
             "success_rate": part.success.mean(), "low": low, "high": high, "loss": cells.loss.mean(),
