@@ -19,7 +19,7 @@ from fedvla_lib.data.batches import Batches
 from fedvla_lib.data.episode_writer import REPO_ID
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.policy import model, prefix_cache
-from fedvla_lib.policy.training import adamw
+from fedvla_lib.policy.optimizers import adamw
 from fedvla_lib.robot.spec import ACTION_KEY, FPS
 from report import laptop, options, recording, report, start, timed
 

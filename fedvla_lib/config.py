@@ -19,7 +19,8 @@ class Config:
     tasks: str = "lift,place,push"  # task names, comma separated; a client is evaluated on the tasks in its own data
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
     image_size: int = 96  # side length of the square camera images, in pixels
-    num_labs: int = 1  # labs that record demonstrations; each has its own cameras, light, colours and calibration
+    num_labs: int = 1  # labs that record demonstrations; each has its cameras, light, colours, calibration, operator
+    one_task_per_lab: bool = False  # lab k records only task k, counted modulo the number of tasks
     val_fraction: float = 0.1  # fraction of each task's episodes held out for validation
     normalisation: str = "pooled"  # joint statistics: pooled, or a deliberate mistake: own, held-out, none
     augment: bool = False  # augment training images; if off, the prefix of a frozen model is cached for each frame
@@ -29,12 +30,13 @@ class Config:
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small values give a client few tasks
     num_server_rounds: int = 10  # federated rounds
     fraction_train: float = 0.4  # fraction of clients that train in each round
+    sampling: str = "uniform"  # who trains in a round: uniform, or by-task: tasks take turns, as clients announce them
     fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
     min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
-    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, fedmedian, krum or scaffold
-    server_lr: float = 0.0  # server learning rate of fedavgm, fedadam and fedyogi; 0 uses the strategy's default
-    server_momentum: float = 0.5  # fedavgm: server momentum coefficient m; constant updates are scaled by 1 / (1 - m)
+    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, diloco, fedexp, fedmedian, krum or scaffold
+    server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
+    server_momentum: float = 0.5  # fedavgm, diloco: server momentum m; constant updates are scaled by 1 / (1 - m)
     clip_norm: float = 0.0  # maximum L2 norm of a client's update; 0 does not clip
     num_malicious: int = 1  # krum: Byzantine clients tolerated per round
     personal: str = ""  # model parts that stay on each client, comma separated: projections, expert layer N
@@ -52,7 +54,9 @@ class Config:
     # local training
     local_steps: int = 20  # gradient steps of a client in each round
     batch_size: int = 32  # samples per gradient step
-    lr: float = 1e-3  # peak learning rate of AdamW; smolvla_base uses 1e-4
+    alone_steps: int = 0  # gradient steps of centralized and local-only training; 0 takes them from the federation
+    lr: float = 1e-3  # peak learning rate of the local optimiser; smolvla_base uses 1e-4
+    local_optimizer: str = "adamw"  # adamw, sgd, adamw-shared or adamw-frozen, see policy/optimizers.py
     keep_optimizer: bool = False  # keep a client's optimiser state from round to round
     warmup_steps: int = 20  # gradient steps of linear learning rate warm-up
     checkpoint_every: int = 200  # gradient steps between checkpoints of local training; 0 keeps only the last
@@ -87,7 +91,11 @@ PROFILES: dict[str, dict[str, Any]] = {
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
 NORMALISATIONS = ("pooled", "own", "held-out", "none")
 EXCHANGES = ("float32", "float16", "int8")
-STRATEGIES = ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedmedian", "krum", "scaffold")
+STRATEGIES = (
+    "fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "diloco", "fedexp", "fedmedian", "krum", "scaffold",
+)  # fmt: skip
+SAMPLINGS = ("uniform", "by-task")
+LOCAL_OPTIMIZERS = ("adamw", "sgd", "adamw-shared", "adamw-frozen")
 
 
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
@@ -140,18 +148,25 @@ def check(config: Config) -> Config:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
     non_negative = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
-        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious",
+        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious", "alone_steps",
     )  # fmt: skip
     for name in non_negative:
         _require(getattr(config, name) >= 0, config, name, "0 or more")
     for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum"):
         _require(0 <= getattr(config, name) <= 1, config, name, "a number from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a number above 0")
-    choices = {"partition": PARTITIONS, "normalisation": NORMALISATIONS, "strategy": STRATEGIES, "exchange": EXCHANGES}
+    choices = {
+        "partition": PARTITIONS, "normalisation": NORMALISATIONS, "strategy": STRATEGIES, "exchange": EXCHANGES,
+        "sampling": SAMPLINGS, "local_optimizer": LOCAL_OPTIMIZERS,
+    }  # fmt: skip
     for name, valid in choices.items():
         _require(getattr(config, name) in valid, config, name, f"one of {', '.join(valid)}")
     limit = f"at most chunk_size={config.chunk_size}"
     _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", limit)
+    whole = not config.one_task_per_lab or config.num_labs % max(1, len(task_names(config))) == 0
+    _require(whole, config, "num_labs", "a multiple of the number of tasks if each lab has one task")
+    apart = not config.personal or not config.local_optimizer.startswith("adamw-")
+    _require(apart, config, "local_optimizer", "adamw or sgd for a model with personal parts")
     _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")
     return config
 

@@ -67,10 +67,9 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
 def serving(grid, examples, share, rounds_done=0, **settings):
     """The strategy of these settings, for the two clients of the grid."""
     nodes = grid.get_node_ids()
-    weights = {node: examples[k] / sum(examples) for k, node in enumerate(nodes)}
     return build.build_strategy(
-        Config(fraction_train=share, **settings), weights, shapes={"w": (1,)},
-        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
+        Config(fraction_train=share, **settings), shapes={"w": (1,)},
+        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}, dict(zip(nodes, examples, strict=True))),
         report=lambda *_: None, keep_rollouts=lambda *_: None, rounds_done=rounds_done,
     )  # fmt: skip
 
@@ -247,6 +246,37 @@ def test_a_server_that_takes_over_continues_from_the_state_of_the_first(name):
     assert federate(8, replaced_after=4, **settings)[0] == federate(8, **settings)[0]
 
 
+def updates_from(w):
+    return np.array([(TARGET[k] - w) * (1 - shrink(k)) for k in range(2)])
+
+
+@pytest.mark.parametrize("examples", [(1, 1), (3, 1)])
+def test_diloco_equals_a_computation_by_hand_and_a_restart_changes_nothing(examples):
+    rate, beta, w, m, expected = 0.7, 0.9, 0.0, 0.0, []
+    for _ in range(6):
+        u = np.average(updates_from(w), weights=examples)
+        m = beta * m + u
+        w += rate * (u + beta * m)
+        expected.append(w)
+    settings = {"strategy": "diloco", "server_momentum": beta}  # the rate is the default
+    assert federate(6, examples, **settings)[0] == pytest.approx(expected, rel=1e-5)
+    assert federate(6, examples, replaced_after=3, **settings)[0] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("examples", [(1, 1), (3, 1)])
+def test_fedexp_equals_a_computation_by_hand(examples):
+    w, expected, rates = 0.0, [], []
+    for _ in range(6):
+        each = updates_from(w)
+        u = np.average(each, weights=examples)
+        rates.append(max(1.0, np.average(each**2, weights=examples) / (2 * (u**2 + 1e-3))))
+        w += rates[-1] * u
+        expected.append(w)
+    assert max(rates) > 1.5
+    # In float32: where the clients nearly cancel, the rate multiplies the rounding of a small mean.
+    assert federate(6, examples, strategy="fedexp")[0] == pytest.approx(expected, rel=1e-3)
+
+
 def test_the_median_ignores_weights():
     path, *_ = federate(1, (1, 100), strategy="fedmedian")
     ends = [TARGET[k] * (1 - shrink(k)) for k in range(2)]
@@ -259,8 +289,8 @@ def test_a_damaged_control_variate_is_rejected():
     nodes = grid.get_node_ids()
     seen = []
     strategy = build.build_strategy(
-        Config(strategy="scaffold", fraction_train=1.0), dict.fromkeys(nodes, 0.5), shapes={"w": (1,)},
-        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}),
+        Config(strategy="scaffold", fraction_train=1.0), shapes={"w": (1,)},
+        roster=Roster({node: node - FIRST_NODE_ID for node in nodes}, dict.fromkeys(nodes, 1)),
         report=lambda _, who, kind, values: seen.append((who, kind, values.get("reason"))),
         keep_rollouts=lambda *_: None,
     )  # fmt: skip

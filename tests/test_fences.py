@@ -39,8 +39,8 @@ FENCES = {
     "mink": {"robot.expert"},
     "gymnasium": {"robot.lerobot_env", "robot.sim"},
     "torch": {
-        "policy.actor", "policy.lean_expert", "policy.lora", "policy.model", "policy.parameters", "policy.prefix_cache",
-        "policy.training",
+        "policy.actor", "policy.lean_expert", "policy.lora", "policy.model", "policy.optimizers", "policy.parameters",
+        "policy.prefix_cache", "policy.training",
         "data.augmentation", "data.batches", "evaluation.held_out", "pretraining.grounding",
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },
@@ -48,7 +48,7 @@ FENCES = {
         "robot.lerobot_env", "data.episode_writer", "data.lerobot_reader", "data.normalisation",
         "policy.lean_expert", "policy.model", "policy.prefix_cache", "policy.training",
     },
-    "transformers": {"policy.nano", "policy.prefix_cache"},
+    "transformers": {"policy.prefix_cache"},
     "flwr": {
         "federation.client_app", "federation.messages", "federation.nodes", "federation.server_app",
         "federation.throttled_grid", STRATEGIES, "engines.inline",

@@ -86,7 +86,7 @@ def one_round(
     roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of)
     config = Config(**{"fraction_train": 1.0, **settings})
     strategy = build.build_strategy(
-        config, {node: 1 / num_clients for node in nodes}, roster=roster, shapes=shapes, report=events.log,
+        config, roster=roster, shapes=shapes, report=events.log,
         keep_rollouts=lambda *_: None,
     )  # fmt: skip
     start = start or random_arrays(99)
@@ -348,7 +348,7 @@ def test_a_client_that_does_not_reply_is_reported():
     grid = InlineGrid(answering(lambda k, _: reply_content(random_arrays(k))), 2, {})
     roster = Roster({node: node - FIRST_NODE_ID for node in grid.get_node_ids()})
     checked = dict(roster=roster, shapes=SHAPES, report=events.log, keep_rollouts=lambda *_: None)
-    strategy = build.build_strategy(Config(fraction_train=1.0), {}, **checked)
+    strategy = build.build_strategy(Config(fraction_train=1.0), **checked)
     messages = strategy.configure_train(1, pack_arrays(GOOD), ConfigRecord(), grid)
     strategy.aggregate_train(1, grid.send_and_receive(messages)[:1])
     assert events.rejected() == {"client_1": "silent"}
@@ -432,7 +432,8 @@ def introducing(
     @app.query()
     def query(message, context):
         k = context.node_config["partition-id"]
-        values = {"partition_id": partition_of[k], "num_examples": 5 + k, "stats": stats_of(k, 5 + k)}
+        values = {"partition_id": partition_of[k], "num_examples": 5 + k, "tasks": ["lift"]}
+        values["stats"] = stats_of(k, 5 + k)
         return Message(RecordDict({NOTE: make_note(**values | (said if k == 1 else {}))}), reply_to=message)
 
     return app
@@ -483,6 +484,9 @@ INTRODUCTIONS = {
     "frames that are true": ("examples", {"num_examples": True}),
     "negative partition": ("partition", {"partition_id": -1}),
     "a partition that is true": ("partition", {"partition_id": True}),
+    "one task as text": ("tasks", {"tasks": "lift"}),
+    "tasks that are numbers": ("tasks", {"tasks": [1, 2]}),
+    "a task as long as a book": ("tasks", {"tasks": ["lift" * 1000]}),
 }
 
 

@@ -9,7 +9,7 @@ import torch
 from fedvla_lib.config import from_profile
 from fedvla_lib.evaluation.held_out import average, measure_frames
 from fedvla_lib.federation import messages
-from fedvla_lib.policy import model, training
+from fedvla_lib.policy import model, optimizers, training
 from fedvla_lib.policy.parameters import load_arrays, trainable, trainable_arrays
 from fedvla_lib.policy.training import Checkpoints, Objective, Start
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
@@ -131,13 +131,13 @@ def test_validation_is_deterministic_and_ignores_padded_actions():
 def test_schedule_continues_where_the_last_round_stopped():
     bundle = model.load_policy(CONFIG, STATS)
     config = replace(CONFIG, lr=1e-2, warmup_steps=4)
-    whole, whole_schedule = training.adamw(bundle, config, 0, 20)
+    whole, whole_schedule = optimizers.adamw(bundle, config, 0, 20)
     rates = []
     for _ in range(20):
         rates.append(whole.param_groups[0]["lr"])
         whole.step()
         whole_schedule.step()
-    later, later_schedule = training.adamw(bundle, config, 7, 20)
+    later, later_schedule = optimizers.adamw(bundle, config, 7, 20)
     for expected in rates[7:]:
         assert later.param_groups[0]["lr"] == pytest.approx(expected)
         later.step()

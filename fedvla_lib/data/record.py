@@ -9,6 +9,7 @@ episode. Episode i has its own files and seeds, so its content does not depend o
 import json
 import sys
 from contextlib import closing
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,18 +29,31 @@ from fedvla_lib.robot.stage import stage_of_process
 from fedvla_lib.robot.tasks import check_tasks
 from fedvla_lib.workers import default_jobs, side_by_side
 
-OLD_DEFAULTS = {"num_labs": 1, "jitter": 0.0}  # settings that older recordings do not state
+OLD_DEFAULTS = {"num_labs": 1, "one_task_per_lab": False, "jitter": 0.0}  # what older recordings do not state
 WORTH_WORKERS = 30  # episodes: fewer are recorded before workers have started
 MAX_ATTEMPTS = 20  # seeds tried per episode until the expert succeeds
 
 
+@dataclass(frozen=True)
+class Scenes:
+    """Where the episodes of a recording are shown."""
+
+    num_labs: int = 1  # labs to record in, in turn; with more than one, the column ``lab_index`` holds the lab
+    one_task_per_lab: bool = False  # lab k records only task k, counted modulo the number of tasks
+    jitter: float = 0.0  # above 0, cameras, light and colours are drawn for every episode, with this spread
+
+    def lab_of(self, index: int, num_tasks: int) -> int:
+        """Return the lab of an episode; episode i shows task ``i % num_tasks``."""
+        return (index if self.one_task_per_lab else index // num_tasks) % self.num_labs
+
+
 def record(
-    tasks: list[str], episodes_per_task: int, root: str | Path, *, image_size: int, seed: int = 0, num_labs: int = 1,
-    jitter: float = 0.0, progress: bool = True,
+    tasks: list[str], episodes_per_task: int, root: str | Path, *, image_size: int, seed: int = 0,
+    progress: bool = True, **scenes: Any,
 ) -> Path:  # fmt: skip
     """Record successful expert episodes of `tasks` into the LeRobotDataset v3.0 folder `root`, and return it.
 
-    Episode i shows ``tasks[i % len(tasks)]`` in lab ``(i // len(tasks)) % num_labs`` (`robot.labs.labs`). Existing
+    Episode i shows ``tasks[i % len(tasks)]`` in lab ``Scenes.lab_of`` of `robot.labs.labs`. Existing
     episodes are kept: the same call continues an interrupted recording and does nothing on a complete one; a larger
     `episodes_per_task` extends it. Many are demonstrated side by side (`workers.default_jobs`), with the same bytes.
 
@@ -48,15 +62,14 @@ def record(
         root: folder to write; a second process recording into it waits for the first.
         image_size: side of the square camera images in pixels, even.
         seed: fixes every episode.
-        num_labs: labs to record in, in turn; with more than one, the column ``lab_index`` holds the lab.
-        jitter: above 0, cameras, light and colours are drawn for every episode, with this spread.
+        **scenes: of `Scenes`.
 
     Raises:
         ValueError: unknown task, unusable size, a folder that is not a recording or has other settings.
         RuntimeError: the expert failed with `MAX_ATTEMPTS` seeds in a row.
     """
     root = Path(root)
-    settings = _settings(tasks, episodes_per_task, image_size, seed, num_labs, jitter)
+    settings = _settings(tasks, episodes_per_task, image_size, seed, Scenes(**scenes))
     _check_folder(root, settings)
     total = episodes_per_task * len(settings["tasks"])
     if _num_recorded(root) == total:
@@ -88,16 +101,14 @@ def demonstrate(env: So100Env, index: int, seed: int) -> Episode:
     raise RuntimeError(f"the expert failed at task {env.task!r}, episode {index}, with {MAX_ATTEMPTS} seeds in a row")
 
 
-def _settings(
-    tasks: list[str], episodes_per_task: int, image_size: int, seed: int, num_labs: int, jitter: float
-) -> dict[str, Any]:
+def _settings(tasks: list[str], episodes_per_task: int, image_size: int, seed: int, scenes: Scenes) -> dict[str, Any]:
     """Return the checked settings that determine the content of a recording."""
     if episodes_per_task < 1 or not tasks:
         raise ValueError(f"cannot record {episodes_per_task} episodes of {tasks}: give 1 or more and at least one task")
     if image_size % 2:
         raise ValueError(f"image_size={image_size} is odd: H.264 video needs an even number of pixels")
     return dict(
-        tasks=check_tasks(tasks), image_size=image_size, seed=seed, num_labs=num_labs, jitter=jitter, fps=FPS,
+        tasks=check_tasks(tasks), image_size=image_size, seed=seed, **asdict(scenes), fps=FPS,
         cameras=list(CAMERAS), episodes_per_task=episodes_per_task,
     )  # fmt: skip
 
@@ -141,7 +152,7 @@ def _record_missing(root: Path, settings: dict[str, Any], missing: range, jobs: 
                     recorder.add(*waiting.pop(done))
                     bar.update()
                     done += 1
-        except KeyboardInterrupt:
+        except BaseException:  # bindings of MuJoCo turn a Ctrl-C into a TypeError
             print(f"interrupted: {_num_recorded(root)} of {total} episodes are in {root}, "
                   "run the same command to continue", file=sys.stderr)  # fmt: skip
             raise
@@ -149,8 +160,8 @@ def _record_missing(root: Path, settings: dict[str, Any], missing: range, jobs: 
 
 def _demonstrated(settings: dict[str, Any], index: int) -> tuple[Episode, int]:
     """Return an episode of a recording, and the number of the lab that it shows."""
-    cycle, task_index = divmod(index, len(settings["tasks"]))
-    lab = cycle % settings["num_labs"]
-    (env,) = stage_of_process(settings["image_size"], settings["jitter"]).envs(settings["tasks"][task_index])
+    tasks, scenes = settings["tasks"], Scenes(**{field.name: settings[field.name] for field in fields(Scenes)})
+    lab = scenes.lab_of(index, len(tasks))
+    (env,) = stage_of_process(settings["image_size"], settings["jitter"]).envs(tasks[index % len(tasks)])
     env.lab = labs(settings["num_labs"])[lab]
     return demonstrate(env, index, settings["seed"]), lab

@@ -16,8 +16,8 @@ def resolve(config: Config) -> Path | str:
     if config.data:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
-    tasks, counts = task_names(config), [config.image_size, config.episodes_per_task, config.seed, config.num_labs]
-    key = json.dumps([tasks, *counts, code_digest(record)])
+    tasks, counts = task_names(config), [config.image_size, config.episodes_per_task, config.seed]
+    key = json.dumps([tasks, *counts, config.num_labs, config.one_task_per_lab, code_digest(record)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     return record_into(cache_dir() / "recordings" / name, config)
 
@@ -25,6 +25,7 @@ def resolve(config: Config) -> Path | str:
 def record_into(root: Path, config: Config) -> Path:
     """Record the demonstrations that a run's settings describe into `root`, and return it; errors as of `record`."""
     scenes = {"image_size": config.image_size, "seed": config.seed, "num_labs": config.num_labs}
+    scenes["one_task_per_lab"] = config.one_task_per_lab
     return record(task_names(config), config.episodes_per_task, root, **scenes)
 
 

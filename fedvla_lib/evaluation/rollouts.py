@@ -100,6 +100,35 @@ def success_rate(rows: Sequence[dict[str, Any]]) -> float:
     return sum(r["success"] for r in rows) / len(rows)
 
 
+def roll_out_in_places(
+    bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: int | None = None
+) -> list[dict[str, Any]]:
+    """Evaluate one model of labs with one task each; rows as of `evaluate`, with a column place.
+
+    Of the seeds, lab k takes every `num_labs`-th from the k-th, on its own task: once in the lab (place "own"), once in
+    the next lab, in which nobody recorded (place "unseen").
+
+    Args:
+        trained_in: number of the only lab that the model saw. It is measured at that lab's task, and on a quarter of
+            the seeds at every other task, in the labs that have it (place "others"). None: at all labs' tasks.
+    """
+    tasks, there, rows = task_names(config), labs(config.num_labs + 1), []
+    actor = PolicyActor(bundle, config.seed)
+
+    def add(place: str, task: str, chosen: Sequence[int], where: Sequence[Lab]) -> None:
+        found = evaluate(actor, [task], chosen, image_size=config.image_size, labs=where, progress=False)
+        rows.extend({**row, "place": place} for row in found)
+
+    for k in range(config.num_labs) if trained_in is None else [trained_in]:
+        task, own = tasks[k % len(tasks)], seeds[k :: config.num_labs]
+        add("own", task, own, [there[k]])
+        add("unseen", task, own, [there[-1]])
+        for n, other in enumerate(tasks) if trained_in is not None else ():
+            if other != task:
+                add("others", other, own[: len(own) // 4], there[n : -1 : len(tasks)])
+    return rows
+
+
 def roll_out(
     bundle: Bundle, config: Config, seeds: Sequence[int], videos_dir: Path | None = None, progress: bool = False,
     jobs: int = 1,

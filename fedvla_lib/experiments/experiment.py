@@ -14,7 +14,7 @@ from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config
 from fedvla_lib.data import recordings
 from fedvla_lib.evaluation import measure
-from fedvla_lib.evaluation.rollouts import success_rate
+from fedvla_lib.evaluation.rollouts import roll_out_in_places, success_rate
 from fedvla_lib.experiments import methods
 from fedvla_lib.experiments.experiment_file import KINDS, Cell, Plan
 from fedvla_lib.federation.nodes import client_name
@@ -35,17 +35,39 @@ class Measured:
     steps: dict[str, dict[str, int]] = field(default_factory=lambda: {GLOBAL: {"in_all": 0, "in_a_row": 0}})
     bytes: int = 0  # exchanged, both directions
     train_s: float = 0.0
+    in_a_row_s: float = 0.0  # the same on as many machines as clients, from the seconds that each client measured
 
 
 def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print, jobs: int = 1) -> None:
-    """Measure every cell that has no run folder in `out` yet, `jobs` of them at a time, each in its own process."""
+    """Measure every cell that has no run folder in `out` yet, `jobs` of them at a time, each in its own process.
+
+    Raises:
+        ValueError: a cell in `out` has other settings or rollouts than the plan's, or was made by other code.
+    """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     todo = [cell for cell in plan.cells if not (out / cell.name).exists()]
+    for cell in plan.cells:
+        if cell not in todo:
+            _check_stored(out / cell.name, cell, plan)
     say(f"{len(plan.cells)} cells, {len(plan.cells) - len(todo)} of them in {out}")
     measured = side_by_side(partial(_timed, measure_cell, seeds=plan.rollout_seeds, out=out), todo, jobs)
     for number, (cell, (rate, seconds)) in enumerate(measured, 1):
         say(f"[{number}/{len(todo)}] {cell.name}: {rate:.0%} in {seconds:.0f} s")
+
+
+def _check_stored(folder: Path, cell: Cell, plan: Plan) -> None:
+    stamp, stored, asked = run_folder.read_stamp(folder), asdict(run_folder.read_config(folder)), asdict(cell.config)
+    found = {"kind": stamp["kind"], "code": stamp["code"], "rollout_seeds": stamp.get("rollout_seeds"), **stored}
+    wanted = {"kind": cell.kind, "code": methods.trained_by(), "rollout_seeds": _ends(plan.rollout_seeds), **asked}
+    if other := [name for name in wanted if found[name] != wanted[name]]:
+        name = other[0]
+        text = f"{folder} was made with {name.replace('_', '-')}={found[name]!r}, not {wanted[name]!r}"
+        raise ValueError(f"{text}: give another folder, or move this one away")
+
+
+def _ends(seeds: Sequence[int]) -> list[int]:
+    return [seeds[0], seeds[-1]]
 
 
 def _timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, float]:
@@ -56,13 +78,13 @@ def _timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tup
 
 def measure_cell(cell: Cell, seeds: Sequence[int], out: Path) -> float:
     """Train and evaluate a cell, write its run folder atomically, and return the success rate."""
-    config, began = with_recording(cell.config), time.perf_counter()
+    config, began = replace(cell.config, videos=False), time.perf_counter()  # nothing shows the videos
     stamp = provenance.first_stamp(cell.config, cell.kind)
     result = MEASURES[cell.kind](config, seeds)
     steps = sum(count["in_all"] for count in result.steps.values())
     costs = {"method": cell.method, "kind": cell.kind, "partition": cell.partition, "steps": result.steps,
              "gradient_steps": steps, "samples": steps * config.batch_size, "bytes": result.bytes,
-             "train_s": result.train_s}  # fmt: skip
+             "train_s": result.train_s, "in_a_row_s": result.in_a_row_s, "rollout_seeds": _ends(seeds)}  # fmt: skip
     ended = {"status": "completed", "wall_s": time.perf_counter() - began, "code": methods.trained_by()}
     with files.new_folder(out / cell.name) as draft:
         files.write_json(draft / "config.json", asdict(cell.config))
@@ -77,7 +99,7 @@ def _log(run: RunFolder, result: Measured, round_number: int, steps: int) -> Non
     for episode in result.episodes:
         run.log(round_number, GLOBAL, "held-out", episode)
     for row in result.rows:
-        values = {key: row[key] for key in ("task", "lab", "seed", "success", "steps", "client") if key in row}
+        values = {key: row[key] for key in ("task", "lab", "seed", "success", "steps", "client", "place") if key in row}
         run.log(round_number, row.get("who", GLOBAL), "rollout", values)
     run.log(round_number, GLOBAL, "evaluate", {**result.held_out, "gradient_steps": steps})
 
@@ -88,7 +110,8 @@ def _base(config: Config, seeds: Sequence[int]) -> Measured:
 
 def _centralized(config: Config, seeds: Sequence[int]) -> Measured:
     bundle, seconds = _timed(methods.centralized, config, progress=False)
-    return replace(_measure(bundle, config, seeds), steps={GLOBAL: methods.counted(config)}, train_s=seconds)
+    steps = {GLOBAL: methods.counted(config)}
+    return replace(_measure(bundle, config, seeds), steps=steps, train_s=seconds, in_a_row_s=seconds)
 
 
 def _federated(config: Config, seeds: Sequence[int]) -> Measured:
@@ -104,6 +127,7 @@ def _federated(config: Config, seeds: Sequence[int]) -> Measured:
         steps={GLOBAL: run_folder.counted_steps(folder)},
         bytes=_exchanged_bytes(run_folder.read_metrics(folder, "replies")),
         train_s=run_folder.read_stamp(folder)["wall_s"],
+        in_a_row_s=float(run_folder.read_metrics(folder, "train").groupby("round").seconds.max().sum()),
     )
 
 
@@ -113,12 +137,15 @@ def _exchanged_bytes(replies: pd.DataFrame) -> int:
 
 def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure each client's own model on all held-out episodes; the rollouts are divided among the clients."""
-    results, steps, seconds = [], {}, 0.0
+    results, steps, seconds = [], {}, []
     for client in range(config.num_clients):
         bundle, took_s = _timed(methods.local_only, config, client, progress=False)
-        seconds += took_s
+        seconds.append(took_s)
         steps[client_name(client)] = methods.counted(config, client)
-        result = _measure(bundle, config, seeds[client :: config.num_clients])
+        if config.one_task_per_lab:
+            result = _measure(bundle, config, seeds, client)
+        else:
+            result = _measure(bundle, config, seeds[client :: config.num_clients])
         results.append(replace(result, rows=[{**row, "client": client} for row in result.rows]))
     episodes = pd.DataFrame([episode for result in results for episode in result.episodes])
     return Measured(
@@ -126,13 +153,17 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
         held_out=pd.DataFrame([result.held_out for result in results]).mean().to_dict(),
         episodes=episodes.groupby("episode_id", as_index=False).mean().to_dict("records") if len(episodes) else [],
         steps=steps,
-        train_s=seconds,
+        train_s=sum(seconds),
+        in_a_row_s=max(seconds),
     )
 
 
-def _measure(bundle: Bundle, config: Config, seeds: Sequence[int]) -> Measured:
-    """Measure one model on all held-out episodes and all tasks."""
-    result = measure.measure(bundle, recordings.open_frames(config), config, seeds=seeds)
+def _measure(bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: int | None = None) -> Measured:
+    """Measure one model on all held-out episodes and all tasks, or in the places of labs with one task each."""
+    in_places = config.one_task_per_lab
+    result = measure.measure(bundle, recordings.open_frames(config), config, seeds=() if in_places else seeds)
+    if in_places:
+        result = replace(result, rollouts=roll_out_in_places(bundle, config, seeds, trained_in))
     averages = {"num_examples": result.num_examples, **result.averages} if result.episodes else {}
     return Measured(result.rollouts, averages, result.episodes)
 
@@ -154,9 +185,3 @@ def _clients(config: Config, seeds: Sequence[int]) -> Measured:
 
 
 MEASURES = dict(zip(KINDS, (_base, _federated, _centralized, _local_only, _clients), strict=True))
-
-
-def with_recording(config: Config) -> Config:
-    """Return settings with the path of the recording, the same for all training seeds, and without videos."""
-    data = config.data or str(recordings.resolve(replace(config, seed=0)))
-    return replace(config, data=data, videos=False)  # nothing shows them

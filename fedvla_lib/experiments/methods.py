@@ -1,9 +1,9 @@
 """The methods that the book compares, on the same data and from the same base.
 
 ``base`` is the starting model; ``local-only`` trains one client on its own episodes; ``federated`` is a federated run
-over all clients; ``centralized`` trains on all clients' episodes. *centralized* gets the total gradient steps of the
-federation, *local-only* that total over the number of clients. Results are cached by settings and by the digest of the
-code that determines them, so a change of either trains again.
+over all clients; ``centralized`` trains on all clients' episodes. Unless `Config.alone_steps` says otherwise,
+*centralized* gets the total gradient steps of the federation, *local-only* that total over the number of clients.
+Results are cached by settings and by the digest of the code that determines them, so a change of either trains again.
 """
 
 import hashlib
@@ -110,7 +110,8 @@ def _trained_alone(config: Config, partition_id: int | None, progress: bool) -> 
         if not folder.exists():
             pooled = partition_id is None
             client = open_pooled(config) if pooled else open_client(config, partition_id)
-            steps, bundle = total_steps(config) if pooled else steps_per_client(config), base(config)
+            steps = config.alone_steps or (total_steps(config) if pooled else steps_per_client(config))
+            bundle = base(config)
             result = train_alone(bundle, client, steps=steps, progress=progress)
             with files.new_folder(folder) as draft:
                 model.write_policy(bundle, draft)

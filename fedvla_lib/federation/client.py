@@ -83,23 +83,32 @@ class Client:
         """Training frames: the client's weight in the average."""
         return self.batches().num_examples
 
+    @property
+    def tasks(self) -> list[str]:
+        """What its training episodes show, sorted; announced to the server."""
+        episodes = self.store.episodes
+        return sorted(set(episodes.task[episodes.episode_id.isin(self.share.train_ids)]))
+
     def statistics(self) -> Stats:
         """Mean, standard deviation, range and count of state and action over the client's training episodes."""
         return episode_stats(self.store, self.share.train_ids)
 
     def train(
-        self, bundle: Bundle, round_number: int, correction: Correction | None = None, moments: Arrays | None = None
-    ) -> training.TrainResult:
+        self, bundle: Bundle, round_number: int, correction: Correction | None = None, moments: Arrays | None = None,
+        second_moments: Arrays | None = None,
+    ) -> training.TrainResult:  # fmt: skip
         """Train for one round, continuing the data order and learning-rate schedule of the round before.
 
         Args:
             correction: changes gradients, as the strategy asks.
             moments: optimiser state after this client's last round; None starts fresh.
+            second_moments: the server's, for a local optimiser that shares them.
         """
         config, steps = self.config, self.config.local_steps
+        before, length = (round_number - 1) * steps, config.num_server_rounds * steps
         return training.local_train(
             bundle, prefix_cache.with_cached_prefixes(bundle, self.batches()), config, steps=steps,
-            start=training.Start((round_number - 1) * steps, config.num_server_rounds * steps, moments),
+            start=training.Start(before, length, moments, second_moments or {}),
             objective=training.Objective(correction=correction), progress=False,
         )  # fmt: skip
 

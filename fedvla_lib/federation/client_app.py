@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.clientapp.typing import Mod
@@ -29,6 +30,7 @@ from fedvla_lib.policy.training import Correction, Parameters
 MOMENTS = "moments"  # optimiser state
 PERSONAL = "own"  # personal parts of the model
 LEFT_OVER = "left-over"  # rounding error of its updates so far
+ALL_RECORDS = (messages.ARRAYS, *messages.EXTRA)  # of arrays, in a message for training
 
 
 def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
@@ -42,7 +44,7 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
     @app.query()
     def query(message: Message, context: Context) -> Message:
         client = _client(context, loaders)
-        known = {"partition_id": client.partition_id, "num_examples": client.num_examples}
+        known = {"partition_id": client.partition_id, "num_examples": client.num_examples, "tasks": client.tasks}
         note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()))
         return Message(RecordDict({messages.NOTE: note}), reply_to=message)
 
@@ -67,7 +69,8 @@ def _trained(client: Client, bundle: Bundle, message: Message, context: Context)
     start = {} if exchange == "float32" else bundle.shared_arrays()  # only needed to send an update
     correction = correction_for(message, context, bundle.shared())
     moments = _load_state(context, MOMENTS) if keeps_moments else None
-    result = client.train(bundle, message.content[messages.CONFIG][messages.ROUND], correction, moments)
+    round_number, second = message.content[messages.CONFIG][messages.ROUND], _sent_second_moments(message, bundle)
+    result = client.train(bundle, round_number, correction, moments, second)
     arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
     metrics = {
         messages.EXAMPLES: result.num_examples, messages.STEPS: result.steps,
@@ -78,6 +81,8 @@ def _trained(client: Client, bundle: Bundle, message: Message, context: Context)
         messages.NOTE: messages.make_note(sha256=digest(arrays)),
     })  # fmt: skip
     attach_control_variates(content, correction, context)
+    if result.second_moments:
+        messages.attach(content, messages.NOTE, messages.SECOND_MOMENTS, result.second_moments)
     if keeps_moments:
         context.state[MOMENTS] = messages.pack_arrays(result.moments)
     if bundle.own:
@@ -132,10 +137,20 @@ def correction_for(message: Message, context: Context, parameters: Parameters) -
     """
     content, shapes = message.content, shapes_of(parameters)
     if messages.CONTROL in content:
-        server = messages.checked_arrays(content, messages.CONFIG, shapes, messages.CONTROL, also=(messages.ARRAYS,))
+        server = messages.checked_arrays(content, messages.CONFIG, shapes, messages.CONTROL, also=ALL_RECORDS)
         return ControlVariates(server, _load_state(context, messages.CONTROL))
     mu = content[messages.CONFIG].get(messages.PROXIMAL_MU, 0.0)
     return Proximal(parameters, mu) if mu else None
+
+
+def _sent_second_moments(message: Message, bundle: Bundle) -> Arrays:
+    """The server's second moments; {} if it sends none. Raise ParameterError if they are invalid."""
+    content, record = message.content, messages.SECOND_MOMENTS
+    if record not in content:
+        return {}
+    shapes = shapes_of(bundle.shared())
+    arrays = messages.checked_arrays(content, messages.CONFIG, shapes, record, also=ALL_RECORDS)
+    return {name: np.maximum(array, 0) for name, array in arrays.items()}
 
 
 def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) -> Arrays:
@@ -152,8 +167,7 @@ def attach_control_variates(reply: RecordDict, correction: Correction | None, co
     """Add SCAFFOLD's control variate to a training reply, and save the new one in the client's state."""
     if isinstance(correction, ControlVariates):
         change = correction.change()
-        reply[messages.CONTROL] = messages.pack_arrays(change)
-        reply[messages.NOTE][messages.CONTROL_DIGEST] = digest(change)
+        messages.attach(reply, messages.NOTE, messages.CONTROL, change)
         context.state[messages.CONTROL] = messages.pack_arrays(correction.updated())
 
 
@@ -169,7 +183,7 @@ def _policy(client: Client, message: Message, loaders: Loaders, context: Context
     stats = client.statistics() if config.normalisation == "own" else normalisation.unpack_stats(sent)
     bundle = loaders.load_policy(config, stats)
     shapes, exchange = shapes_of(bundle.shared()), DOWNWARD[config.exchange]
-    arrays = messages.checked_arrays(content, messages.CONFIG, shapes, also=(messages.CONTROL,), exchange=exchange)
+    arrays = messages.checked_arrays(content, messages.CONFIG, shapes, also=ALL_RECORDS, exchange=exchange)
     load_arrays(bundle.policy, arrays | (_load_state(context, PERSONAL) or bundle.own))
     return bundle
 

@@ -2,7 +2,8 @@
 
 Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
 Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
-SCAFFOLD adds ``control`` both ways: control variates, checked like the arrays.
+SCAFFOLD adds ``control`` both ways, control variates, and some local optimisers ``second_moments``; both are checked
+like the arrays.
 """
 
 import io
@@ -10,7 +11,6 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,18 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from fedvla_lib.federation.quantisation import check_encoded, decode
-from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest
+from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest, digest
 from fedvla_lib.robot.spec import JOINT_NAMES
 
-ARRAYS, CONTROL, CONFIG, METRICS, NOTE = "arrays", "control", "config", "metrics", "note"  # records
+# Rows, one per rollout, as from `rollouts.evaluate` with file names as videos; and the files (mp4, npz) by name.
+Rollouts = tuple[list[dict[str, Any]], dict[str, bytes]]
+ARRAYS, CONFIG, METRICS, NOTE = "arrays", "config", "metrics", "note"  # records
+CONTROL, SECOND_MOMENTS = EXTRA = "control", "second_moments"  # records of arrays that some settings add
 
 ROUND = "server-round"  # Flower's own key
 EXAMPLES = "num-examples"  # training frames: the weight of a client
 STEPS = "steps"  # gradient steps that the client counted while training
 DIGEST = "sha256"  # of the arrays
-CONTROL_DIGEST = "sha256-control"
 PROXIMAL_MU = "proximal-mu"  # Flower's own key
 DATA = "data"  # in a node's config: the client's own data set
 PARTITION = "partition-id"  # Flower's own key in a node's config
@@ -64,6 +66,17 @@ def unpack_arrays(record: ArrayRecord) -> Arrays:
     return arrays
 
 
+def digest_key(record: str) -> str:
+    """Return the key of the SHA-256 of a record of arrays."""
+    return DIGEST if record == ARRAYS else f"{DIGEST}-{record}"
+
+
+def attach(content: RecordDict, digest_in: str, record: str, arrays: Arrays) -> None:
+    """Add a record of arrays, and its SHA-256 to record `digest_in`."""
+    content[record] = pack_arrays(arrays)
+    content[digest_in][digest_key(record)] = digest(arrays)
+
+
 def checked_arrays(
     content: RecordDict, digest_in: str, shapes: Shapes, record: str = ARRAYS,
     also: tuple[str, ...] = (), exchange: str = "float32",
@@ -77,7 +90,7 @@ def checked_arrays(
     Raises:
         ParameterError: what is wrong, in one line.
     """
-    key = {ARRAYS: DIGEST, CONTROL: CONTROL_DIGEST}[record]
+    key = digest_key(record)
     announced = content.config_records.get(digest_in, {}).get(key)
     names = list(content.array_records)
     if record not in names or set(names) - {record, *also}:
@@ -98,14 +111,6 @@ def count_bytes(content: RecordDict) -> int:
     # Flower's `ConfigRecord.count_bytes` fails on an empty list or text.
     rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
     return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
-
-
-@dataclass(frozen=True)
-class Rollouts:
-    """The result of a client's rollouts."""
-
-    rows: list[dict[str, Any]]  # one per rollout, as from `rollouts.evaluate`; video is a file name
-    files: dict[str, bytes]  # videos (mp4) and trajectories (npz) by file name
 
 
 def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
@@ -136,7 +141,7 @@ def unpack_rollouts(content: RecordDict) -> Rollouts:
     ]  # fmt: skip
     if bad or not usable:
         raise ParameterError("rollouts", f"expected files rollout_<timestamp>....mp4 or .npz, got {sorted(files)}")
-    return Rollouts(rows, files)
+    return rows, files
 
 
 def make_note(**values: Any) -> ConfigRecord:

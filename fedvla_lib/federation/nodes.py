@@ -1,6 +1,7 @@
 """The nodes of a run: Flower gives them random ids, and each says once which partition it holds."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,6 +21,7 @@ Report = Callable[[int, str, str, dict[str, Any]], None]
 MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # -> length
 MOST_FRAMES = 2**40  # keeps the sum of all counts in 64 bits; it does not protect against a client that lies
 LARGEST = float(np.finfo(np.float32).max)  # policies normalise in float32; its square is still finite in float64
+LONGEST = 1000  # characters of the name of a task
 ROUNDING = 1e-6  # relative: how far a mean may lie outside its range
 
 
@@ -34,6 +36,7 @@ class Roster:
     partition_of: dict[int, int]
     examples_of: dict[int, int] = field(default_factory=dict)  # training frames
     stats_of: dict[int, Stats] = field(default_factory=dict)
+    tasks_of: dict[int, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def nodes(self) -> list[int]:
@@ -44,11 +47,24 @@ class Roster:
         """Return the client's name: ``client_3`` holds partition 3."""
         return client_name(self.partition_of[node_id])
 
-    def sample(self, share: float, rng: np.random.Generator) -> list[int]:
-        """Sample a share of the clients without replacement: `sample_size` node ids, ordered by partition."""
+    def sample(self, share: float, rng: np.random.Generator, by_task: bool = False) -> list[int]:
+        """Sample a share of the clients without replacement: `sample_size` node ids, ordered by partition.
+
+        Args:
+            by_task: deal the places to the announced tasks in turn, so that no task is missed if there are enough.
+        """
         nodes = self.nodes
         size = sample_size(share, len(nodes))
-        return [nodes[i] for i in sorted(rng.choice(len(nodes), size=size, replace=False))]
+        if by_task:
+            drawn, seen = rng.permutation(len(nodes)), Counter()
+            turn = {}  # of each client: how many with its tasks were drawn before
+            for i in drawn.tolist():
+                turn[i] = seen[self.tasks_of[nodes[i]]]
+                seen[self.tasks_of[nodes[i]]] += 1
+            chosen = sorted(drawn.tolist(), key=turn.get)[:size]  # stable: within a turn in the order drawn
+        else:
+            chosen = rng.choice(len(nodes), size=size, replace=False)
+        return [nodes[i] for i in sorted(chosen)]
 
     def add(self, reply: Message) -> None:
         """Add the client that introduces itself in `reply`; raise ParameterError if it cannot take part."""
@@ -60,11 +76,15 @@ class Roster:
         if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
             text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
             raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
+        tasks = note.get("tasks")
+        if not isinstance(tasks, list) or not all(isinstance(task, str) and len(task) < LONGEST for task in tasks):
+            raise ParameterError("tasks", f"{client_name(partition_id)}: tasks={str(tasks)[:LONGEST]}: expected texts")
         try:
             self.stats_of[node] = _statistics(note.get("stats"), num_examples)
         except ParameterError as error:
             raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
         self.partition_of[node], self.examples_of[node] = partition_id, num_examples
+        self.tasks_of[node] = tuple(tasks)
 
 
 def sample_size(share: float, num_clients: int) -> int:

@@ -74,8 +74,6 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster = _introduce(grid, config, run)
-    total = sum(roster.examples_of.values())
-    weights = {node: examples / total for node, examples in roster.examples_of.items()}
     pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
@@ -83,7 +81,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     if saved:  # in the model's order, not the file's
         arrays, done = {name: saved.arrays[name] for name in arrays}, saved.round
     strategy = build_strategy(
-        config, weights, roster=roster, shapes=shapes_of(arrays), report=run.log,
+        config, roster=roster, shapes=shapes_of(arrays), report=run.log,
         keep_rollouts=partial(_keep_rollouts, run), rounds_done=done,
     )  # fmt: skip
     if saved:
@@ -186,10 +184,11 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
 def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: messages.Rollouts) -> None:
     """Write a client's videos and log its rollouts."""
     folder = run.videos_dir(round_number, who)
-    for name, content in rollouts.files.items():
+    rows, contents = rollouts
+    for name, content in contents.items():
         folder.mkdir(parents=True, exist_ok=True)
         files.write_atomically(folder / name, content)
-    rows = [{**row, "video": str(folder / row["video"])} for row in rollouts.rows]
+    rows = [{**row, "video": str(folder / row["video"])} for row in rows]
     measure.log_rollouts(run, round_number, who, rows)
 
 

@@ -1,16 +1,16 @@
 """The training loop of one policy, for a client's round and for centralized training.
 
-Optimiser, schedule and clipping are SmolVLA's presets in LeRobot; the loss is the policy's flow-matching loss with
-padded actions masked.
+Schedule and clipping are SmolVLA's presets in LeRobot, the optimiser is one of `optimizers`; the loss is the policy's
+flow-matching loss with padded actions masked.
 """
 
 import json
 import time
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config
 from fedvla_lib.files import new_folder
+from fedvla_lib.policy import optimizers
 from fedvla_lib.policy.model import Bundle, use_threads
 from fedvla_lib.policy.parameters import Arrays, trainable
 from fedvla_lib.policy.prefix_cache import PREFIX_KEY, prefix_loss
@@ -32,16 +33,6 @@ LOSSES_FILE = "losses.json"
 Loss = Callable[[Bundle, dict[str, Any]], torch.Tensor]  # of a policy on a raw batch
 
 
-class TrainingBatches(Protocol):
-    """An endless, seekable stream of raw batches, such as `data.batches.Batches`."""
-
-    seed: int
-    num_examples: int
-
-    def at(self, step: int) -> dict[str, Any]:
-        """Return the raw batch of a gradient step; the same step gives the same batch."""
-
-
 @dataclass(frozen=True)
 class TrainResult:
     """Result of local training."""
@@ -51,6 +42,7 @@ class TrainResult:
     steps: int  # of the optimiser, counted as it took them, and those before a resume
     seconds: float  # wall time of this call
     moments: Arrays = field(default_factory=dict)  # optimiser state by name; empty unless `Start.moments` was given
+    second_moments: Arrays = field(default_factory=dict)  # by parameter, if the local optimiser shares them
 
 
 @dataclass(frozen=True)
@@ -60,6 +52,7 @@ class Start:
     step: int = 0  # gradient steps of earlier rounds: position in the data and in the learning-rate schedule
     total_steps: int | None = None  # length of the schedule; None ends it with the call
     moments: Arrays | None = None  # optimiser state of an earlier result; {} starts fresh and returns the state
+    second_moments: Arrays = field(default_factory=dict)  # the server's, for a local optimiser that shares them
 
 
 @dataclass(frozen=True)
@@ -82,10 +75,13 @@ FRESH, FLOW_MATCHING = Start(), Objective()
 
 
 def local_train(
-    bundle: Bundle, batches: TrainingBatches, config: Config, *, steps: int, start: Start = FRESH,
+    bundle: Bundle, batches: Any, config: Config, *, steps: int, start: Start = FRESH,
     checkpoints: Checkpoints | None = None, objective: Objective = FLOW_MATCHING, progress: bool = True,
 ) -> TrainResult:  # fmt: skip
     """Train the policy's trainable parameters in place for `steps` gradient steps.
+
+    Args:
+        batches: an endless stream like `data.batches.Batches`: ``seed``, ``num_examples`` and ``at(step)``.
 
     Raises:
         FloatingPointError: the loss is not finite; checkpoints so far are kept.
@@ -93,7 +89,8 @@ def local_train(
     use_threads(config, bundle.policy)
     began, loss = time.perf_counter(), objective.loss or flow_loss
     with _seeded(batches.seed, start.step):
-        optimizer, scheduler = adamw(bundle, config, start.step, start.total_steps or start.step + steps)
+        length = start.total_steps or start.step + steps
+        optimizer, scheduler = optimizers.build(bundle, config, start.step, length, start.second_moments)
         _load_moments(bundle, optimizer, start.moments or {})
         losses, taken, parameters = _restore(bundle, optimizer, scheduler, checkpoints), [], trainable(bundle.policy)
         optimizer.register_step_post_hook(lambda *_: taken.append(1))  # counts what the optimiser did
@@ -111,7 +108,9 @@ def local_train(
                 _checkpoint(bundle, optimizer, scheduler, losses, Path(checkpoints.folder))
         bundle.policy.eval()
         after = {} if start.moments is None else _moments(bundle, optimizer)
-    return TrainResult(losses, batches.num_examples, done + len(taken), time.perf_counter() - began, after)
+        shares = config.local_optimizer in optimizers.SHARING
+        squares = optimizers.second_moments_of(bundle, optimizer) if shares else {}
+    return TrainResult(losses, batches.num_examples, done + len(taken), time.perf_counter() - began, after, squares)
 
 
 def _step(
@@ -154,22 +153,6 @@ def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arr
         name, kind = key.rsplit("|", 1)
         device = "cpu" if kind == "step" else named[name].device  # PyTorch keeps the step count on the CPU
         optimizer.state[named[name]][kind] = torch.from_numpy(value.copy()).to(device)
-
-
-def adamw(bundle: Bundle, config: Config, start_step: int, total_steps: int) -> tuple[torch.optim.Optimizer, Any]:
-    """SmolVLA's AdamW and cosine-with-warm-up presets with the run's learning rate and length, at `start_step`."""
-    settings = bundle.policy.config
-    optimizer = replace(settings.get_optimizer_preset(), lr=config.lr).build(list(trainable(bundle.policy).values()))
-    if str(settings.device) == "cpu":  # one call for all arrays; elsewhere PyTorch's default does so
-        optimizer.param_groups[0]["fused"] = True
-    floor = config.lr * settings.scheduler_decay_lr / settings.optimizer_lr  # the preset's ratio of final to peak rate
-    schedule = {"num_warmup_steps": config.warmup_steps, "num_decay_steps": total_steps}
-    preset = replace(settings.get_scheduler_preset(), peak_lr=config.lr, decay_lr=floor, **schedule)
-    scheduler = preset.build(optimizer, total_steps)
-    scheduler.last_epoch = start_step
-    for group in optimizer.param_groups:
-        group["lr"] = config.lr * scheduler.lr_lambdas[0](start_step)
-    return optimizer, scheduler
 
 
 @contextmanager

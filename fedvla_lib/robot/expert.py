@@ -233,10 +233,6 @@ PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
     "sort": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
         layout.cubes[1], layout.zones_xy_m[1], GRASP_HEIGHT_M
     ),
-    "pick": lambda plan, layout, cube: plan.grasp(cube).move((*cube.xy_m, LIFT_HEIGHT_M), cube.yaw_rad, CLOSED),
-    "square": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M),
-    "circle": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M),
-    "tower": lambda plan, layout, cube: plan.carry(cube, layout.cubes[1].xy_m, STACK_HEIGHT_M),
     "pile": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
         layout.cubes[1], layout.zones_xy_m[0], STACK_HEIGHT_M
     ),
@@ -252,3 +248,4 @@ PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
     "point_square": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
     "point_circle": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
 }
+PLANS |= {"pick": PLANS["lift"], "square": PLANS["place"], "circle": PLANS["place"], "tower": PLANS["stack"]}

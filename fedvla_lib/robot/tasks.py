@@ -22,7 +22,6 @@ REST_SPEED_MPS = 0.02  # below this the cube is at rest
 AWAY_M = 0.04  # minimum distance from grasp point to cube once the cube is released
 PLACE_HALF_M = 0.040  # half the side of the square
 PUSH_RADIUS_M = 0.045  # radius of the circle
-LAB_HALF_M, LAB_RADIUS_M = 0.052, 0.057  # the same of the ten labs' square and circle
 REACH_M = 0.012  # maximum horizontal distance from grasp point to cube centre
 REACH_HEIGHT_M = (0.020, 0.050)  # range of the vertical distance
 POINT_M = 0.020  # maximum horizontal distance from grasp point to zone centre
@@ -68,19 +67,24 @@ class Task:
     apart_m: tuple[float, float, float] = (layout.CUBES_APART_M, layout.ZONES_APART_M, 0.0)
 
 
-def _placed(state: TaskState, half_m: float = PLACE_HALF_M) -> bool:
-    inside = max(abs(offset) for offset in state.zone_offset_m) < half_m - CUBE_HALF_M
-    return state.carried and inside and _released(state) and _at_rest(state)
+def _placed(state: TaskState) -> bool:
+    return state.carried and _in_square(state) and _released(state) and _at_rest(state)
+
+
+def _in_square(state: TaskState) -> bool:
+    return max(abs(offset) for offset in state.zone_offset_m) < PLACE_HALF_M - CUBE_HALF_M
+
+
+def _in_circle(state: TaskState) -> bool:
+    return float(np.hypot(*state.zone_offset_m)) < PUSH_RADIUS_M - CUBE_HALF_M
 
 
 def _circled(state: TaskState) -> bool:
-    inside = float(np.hypot(*state.zone_offset_m)) < LAB_RADIUS_M - CUBE_HALF_M
-    return state.carried and inside and _released(state) and _at_rest(state)
+    return state.carried and _in_circle(state) and _released(state) and _at_rest(state)
 
 
 def _pushed(state: TaskState) -> bool:
-    inside = float(np.hypot(*state.zone_offset_m)) < PUSH_RADIUS_M - CUBE_HALF_M
-    return inside and _slid(state) and not state.carried and not state.flung and _at_rest(state)
+    return _in_circle(state) and _slid(state) and not state.carried and not state.flung and _at_rest(state)
 
 
 def _stacked(state: TaskState) -> bool:
@@ -93,8 +97,7 @@ def _stacked(state: TaskState) -> bool:
 
 def _piled(state: TaskState) -> bool:
     (upper,) = state.others
-    inside = max(abs(offset) for offset in state.zone_offset_m) < LAB_HALF_M - CUBE_HALF_M
-    return inside and state.carried and _stacked(replace(upper, others=(state,)))
+    return _in_square(state) and state.carried and _stacked(replace(upper, others=(state,)))
 
 
 def _reached(state: TaskState) -> bool:
@@ -159,15 +162,16 @@ TASKS = _by_name(
 )  # fmt: skip
 
 # The five tasks of the benchmark "ten labs": in each two cubes, a square and a circle anywhere on the table, so that
-# only the instruction tells which cube goes where; *pile* takes two steps.
-_CUBES = Region((0.185, 0.23), (-28.0, 28.0))
-_ZONES = Region((0.185, 0.225), (-42.0, 42.0))
-_SQUARE, _CIRCLE = Patch(_ZONES, "square", LAB_HALF_M), Patch(_ZONES, "disc", LAB_RADIUS_M)
-_LAB = {"cube": _CUBES, "other": _CUBES, "zones": (_SQUARE, _CIRCLE), "apart_m": (0.08, 0.11, 0.065)}
+# only the instruction tells which cube goes where; *pile* takes two steps. Zones are no larger than those that the base
+# has seen, and stand off from the cubes: beside larger or nearer ones it finds a named cube half as often.
+_CUBES = Region((0.185, 0.23), (-20.0, 20.0))
+_ZONES = Region((0.185, 0.225), (-44.0, 44.0))
+_SQUARE, _CIRCLE = Patch(_ZONES, "square", PLACE_HALF_M), Patch(_ZONES, "disc", PUSH_RADIUS_M)
+_LAB = {"cube": _CUBES, "other": _CUBES, "zones": (_SQUARE, _CIRCLE), "apart_m": (0.07, 0.11, 0.08)}
 LAB_TASKS = _by_name(
     Task("pick", ("Pick up the {color} cube.",), TASKS["lift"].success, hold_steps=5, horizon_steps=75, **_LAB),
-    Task("square", ("Move the {color} cube to the yellow square.",), lambda state: _placed(state, LAB_HALF_M),
-         hold_steps=4, horizon_steps=120, **_LAB),
+    Task("square", ("Move the {color} cube to the yellow square.",), _placed, hold_steps=4,
+         horizon_steps=120, **_LAB),
     Task("circle", ("Move the {color} cube to the white circle.",), _circled, hold_steps=4, horizon_steps=120,
          **_LAB | {"zones": (_CIRCLE, _SQUARE)}),
     Task("tower", ("Put the {color} cube on top of the {other} cube.",), _stacked, hold_steps=4, horizon_steps=120,

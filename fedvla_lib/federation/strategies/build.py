@@ -1,4 +1,4 @@
-"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or SCAFFOLD."""
+"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or one that Flower has not."""
 
 from typing import Any
 
@@ -6,19 +6,19 @@ from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx
 
 from fedvla_lib.config import Config
 from fedvla_lib.federation.strategies.checked import Checked
+from fedvla_lib.federation.strategies.outer_steps import DiLoCo, FedExP
 from fedvla_lib.federation.strategies.scaffold import CheckedScaffold
 
 # Default server learning rates for pretrained weights. With Flower's 0.1, a round can change each weight by 0.1,
 # which is as much as the weights themselves.
-SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01}
+SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01, "diloco": 0.7}
 ADAPTIVITY = 1e-3  # tau: added to the root of the second moment
 
 
-def build_strategy(config: Config, weights: dict[int, float], **checked: Any) -> Checked:
+def build_strategy(config: Config, **checked: Any) -> Checked:
     """Return the strategy that the settings name.
 
     Args:
-        weights: each node's share of all training frames.
         **checked: the other arguments of `Checked`.
     """
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
@@ -35,11 +35,15 @@ def build_strategy(config: Config, weights: dict[int, float], **checked: Any) ->
         "fedadam": (FedAdam, {"eta": rate, "tau": ADAPTIVITY}),
         # Yogi: the same with a second moment that grows more slowly (Reddi et al. 2021, same paper)
         "fedyogi": (FedYogi, {"eta": rate, "tau": ADAPTIVITY}),
+        # a Nesterov step along the averaged update (Douillard et al. 2023, https://arxiv.org/abs/2311.08105)
+        "diloco": (DiLoCo, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
+        # a longer step the more the updates disagree (Jhunjhunwala et al. 2023, https://arxiv.org/abs/2301.09604)
+        "fedexp": (FedExP, {}),
         # the median of each coordinate, every client counting alike (Yin et al. 2018, https://arxiv.org/abs/1803.01498)
         "fedmedian": (FedMedian, {}),
         # the one model that lies closest to the others (Blanchard et al. 2017, https://arxiv.org/abs/1703.02757)
         "krum": (Krum, {"num_malicious_nodes": config.num_malicious}),
-        "scaffold": (CheckedScaffold, {"weights": weights}),
+        "scaffold": (CheckedScaffold, {}),
     }[config.strategy]
     if not issubclass(strategy, Checked):
         strategy = type(f"Checked{strategy.__name__}", (Checked, strategy), {})

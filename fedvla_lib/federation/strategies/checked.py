@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
 
 from fedvla_lib.config import Config
@@ -21,11 +21,12 @@ from fedvla_lib.federation import messages
 from fedvla_lib.federation.drift import geometry
 from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
+from fedvla_lib.policy.optimizers import SHARING
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
 
 logger = logging.getLogger(__name__)
-PERSISTENT = ("momentum_vector", "m_t", "v_t", "control")  # attributes of strategies that persist between rounds
+PERSISTENT = ("momentum_vector", "m_t", "v_t", *messages.EXTRA)  # attributes of strategies that persist between rounds
 
 
 class Checked:
@@ -41,7 +42,7 @@ class Checked:
         **flower: passed on to the Flower strategy.
     """
 
-    _extra_records: tuple[str, ...] = ()  # records of arrays in a training reply beside the model's
+    _extra_records: tuple[str, ...] = ()  # attributes with arrays that travel beside the model's, both ways in training
 
     def __init__(
         self, *, config: Config, roster: Roster, shapes: Shapes, report: Report,
@@ -50,6 +51,9 @@ class Checked:
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.config, self.roster, self.shapes = config, roster, shapes
         self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
+        if config.local_optimizer in SHARING:
+            self.second_moments: Arrays = {}
+            self._extra_records += (messages.SECOND_MOMENTS,)
         self._sampled: list[int] = []
         self._sent_bytes = 0
         self._global: Arrays = {}
@@ -116,6 +120,9 @@ class Checked:
 
     def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
         """Flower's, with encoded arrays and their SHA-256; strategies have stored the unrounded ones by now."""
+        for name in self._extra_records if message_type == MessageType.TRAIN else ():
+            if extra := getattr(self, name):  # second moments are known after the first round
+                messages.attach(record, messages.CONFIG, name, extra)
         arrays = encode(messages.unpack_arrays(record[messages.ARRAYS]), DOWNWARD[self.config.exchange])
         record[messages.CONFIG][messages.DIGEST] = digest(arrays)
         if self.config.exchange != "float32":
@@ -141,16 +148,25 @@ class Checked:
             reply.content[messages.ARRAYS] = messages.pack_arrays(clipped)
 
     def _before_aggregation(self, server_round: int, valid: list[Message]) -> None:
-        """Report the client drift of the valid training replies, before they are aggregated."""
+        """Combine and remove the extra records, and report the client drift, of the valid training replies."""
+        for name in self._extra_records if valid else ():
+            arrived = {reply.metadata.src_node_id: messages.unpack_arrays(reply.content.pop(name)) for reply in valid}
+            setattr(self, name, self._combined(name, arrived))
         nodes = [reply.metadata.src_node_id for reply in valid]
         ends = {self.roster.name(node): self._arrived.pop(node) for node in nodes}
         for who, values in geometry(self._global, ends).items():
             self.report(server_round, who, "drift", values)
 
+    def _combined(self, record: str, arrived: dict[int, Arrays]) -> Arrays:
+        """Return the new arrays of an extra record: the mean of the clients', weighted by training frames."""
+        frames, replies = [self.roster.examples_of[node] for node in arrived], list(arrived.values())
+        means = {name: np.average([reply[name] for reply in replies], 0, frames) for name in replies[0]}
+        return {name: mean.astype(np.float32) for name, mean in means.items()}
+
     def _sample(self, share: float, server_round: int, purpose: int) -> SimpleNamespace:
         """Sample clients, and return a stand-in for the grid that lists only them."""
         rng = np.random.default_rng([self.config.seed, server_round + self.rounds_done, purpose])
-        self._sampled = self.roster.sample(share, rng)
+        self._sampled = self.roster.sample(share, rng, by_task=self.config.sampling == "by-task")
         return SimpleNamespace(get_node_ids=lambda: self._sampled)
 
     def _valid(
@@ -191,8 +207,10 @@ class Checked:
         if _examples(reply) != announced:  # its weight in the average must not change
             found = f"{messages.EXAMPLES}={_examples(reply)}"
             raise ParameterError("examples", f"{found}, but the client first reported {announced}")
-        exchange, also = self.config.exchange, self._extra_records
-        arrays = messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=also, exchange=exchange)
+        exchange, extra = self.config.exchange, self._extra_records
+        arrays = messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=extra, exchange=exchange)
+        for record in extra:
+            messages.checked_arrays(reply.content, messages.NOTE, self.shapes, record, (messages.ARRAYS, *extra))
         self._arrived[reply.metadata.src_node_id] = arrays
 
 

@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp.strategy import FedAvg
 
 from fedvla_lib.federation import messages
 from fedvla_lib.federation.strategies.checked import Checked
-from fedvla_lib.policy.parameters import Arrays, digest
+from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.policy.training import Parameters, with_gradient
 
 
@@ -54,36 +53,22 @@ class CheckedScaffold(Checked, FedAvg):
     """SCAFFOLD (Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378): FedAvg with control variates.
 
     The server keeps c = sum_k p_k c_k over all clients and sends it with the model; `ControlVariates` is the client
-    side. The paper weighs clients equally; here p_k = n_k / sum n, as in averaging, because otherwise the optimum of
-    the averaged loss would not be a fixed point.
-
-    Args:
-        weights: p_k by node id, for all clients, sampled or not.
-        **checked: arguments of `Checked`.
+    side. The paper weighs clients equally; here p_k = n_k / sum n over all clients, sampled or not, as in averaging,
+    because otherwise the optimum of the averaged loss would not be a fixed point.
     """
 
     _extra_records = (messages.CONTROL,)
 
-    def __init__(self, *, weights: dict[int, float], **checked: Any) -> None:
+    def __init__(self, **checked: Any) -> None:
         super().__init__(**checked)
-        self.weights = weights
         self.control: Arrays = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
 
-    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
-        """Add the server's control variate and its SHA-256."""
-        if message_type == MessageType.TRAIN:
-            record[messages.CONTROL] = messages.pack_arrays(self.control)
-            record[messages.CONFIG][messages.CONTROL_DIGEST] = digest(self.control)
-        return super()._construct_messages(record, node_ids, message_type)
-
-    def _before_aggregation(self, server_round: int, replies: list[Message]) -> None:
-        """Add the clients' changes to c, and remove them from the replies."""
-        for reply in replies:
-            change = messages.unpack_arrays(reply.content.pop(messages.CONTROL))
-            weight = np.float32(self.weights[reply.metadata.src_node_id])
-            self.control = {name: array + weight * change[name] for name, array in self.control.items()}
-        super()._before_aggregation(server_round, replies)
-
-    def _check_train(self, reply: Message) -> None:
-        super()._check_train(reply)
-        messages.checked_arrays(reply.content, messages.NOTE, self.shapes, messages.CONTROL, also=(messages.ARRAYS,))
+    def _combined(self, record: str, arrived: dict[int, Arrays]) -> Arrays:
+        """Add the clients' changes to c."""
+        if record != messages.CONTROL:
+            return super()._combined(record, arrived)
+        total, control = sum(self.roster.examples_of.values()), self.control
+        for node, change in arrived.items():
+            weight = np.float32(self.roster.examples_of[node] / total)
+            control = {name: array + weight * change[name] for name, array in control.items()}
+        return control
