@@ -77,10 +77,14 @@ class _WithoutText(ast.NodeTransformer):
         return None if is_text else self.generic_visit(node)
 
 
+def deciding(config: Config) -> dict[str, Any]:
+    """Return the settings that decide a run's results: all but out, num_threads and resume."""
+    return {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
+
+
 def config_hash(config: Config) -> str:
-    """Return a short hash of the settings that decide a run's results: all but out, num_threads and resume."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+    """Return a short hash of the settings that decide a run's results."""
+    return hashlib.sha256(json.dumps(deciding(config), sort_keys=True).encode()).hexdigest()[:12]
 
 
 def first_stamp(config: Config, engine: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 
 from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.files import as_json, write_atomically, write_json
-from fedvla_lib.provenance import config_hash, first_stamp, now
+from fedvla_lib.provenance import config_hash, deciding, first_stamp, now
 
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
 GLOBAL, LOCK, METRICS_FILE = "global", ".lock", "metrics.jsonl"
@@ -124,12 +124,11 @@ def resumable(root: Path, config: Config) -> dict[str, Any]:
     Raises:
         ValueError: not a run folder, a completed run, or a run with other settings.
     """
-    stamp, saved = read_stamp(_existing(root)), read_config(root)
+    stamp, saved, asked = read_stamp(_existing(root)), deciding(read_config(root)), deciding(config)
     if stamp["status"] == "completed":
         raise ValueError(f"resume={str(root)!r} is a completed run: there is nothing to resume")
-    if config_hash(saved) != config_hash(config):
-        other = {name for name, value in asdict(saved).items() if value != getattr(config, name)}
-        name = min(other - {"out", "num_threads", "resume"}).replace("_", "-")
+    if other := [name for name in asked if saved[name] != asked[name]]:
+        name = other[0].replace("_", "-")
         raise ValueError(f"resume={str(root)!r} was run with another {name}: resume it with its own settings")
     return stamp
 

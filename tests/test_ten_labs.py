@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from fedvla_book.tables.results import read_results, summary
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile
@@ -14,7 +15,7 @@ from fedvla_lib.federation.nodes import Roster
 from fedvla_lib.robot.labs import labs
 
 pytestmark = pytest.mark.integration
-TASKS = "pick,square"
+TASKS = "square,tower"
 SETTINGS = {"tasks": TASKS, "num_labs": 4, "one_task_per_lab": True, "episodes_per_task": 4, "partition": "lab",
             "num_clients": 4, "val_fraction": 0.0, "num_threads": 1}  # fmt: skip
 
@@ -76,7 +77,7 @@ def test_a_global_model_is_measured_at_every_lab_s_task_at_home_and_in_the_unsee
     assert len(own) == len(unseen) == 16 and len(rows) == 32
     assert Counter(own.lab) == {lab.name: 4 for lab in there[:4]} and set(unseen.lab) == {there[4].name}
     task = {lab.name: TASKS.split(",")[k % 2] for k, lab in enumerate(there)}
-    assert (own.lab.map(task) == own.task).all() and Counter(unseen.task) == {"pick": 8, "square": 8}
+    assert (own.lab.map(task) == own.task).all() and Counter(unseen.task) == {"square": 8, "tower": 8}
 
 
 def test_a_lab_alone_is_measured_on_the_same_rollouts_and_at_the_others_tasks(grid):
@@ -91,6 +92,14 @@ def test_a_lab_alone_is_measured_on_the_same_rollouts_and_at_the_others_tasks(gr
     assert Counter(others.client) == dict.fromkeys(range(4), 1)
     for row in others.itertuples():
         assert row.task != TASKS.split(",")[int(row.client) % 2] and row.lab in {lab.name for lab in there[:4]}
+
+
+def test_the_book_reads_demonstrations_place_and_time(grid):
+    rows = read_results(grid / "out")
+    assert set(rows.demonstrations) == {2} and set(rows.place) == {"own", "unseen", "others"}
+    found = summary(rows, ["partition", "method", "place"]).set_index(["method", "place"])
+    assert found.rollouts[("alone", "own")] == found.rollouts[("pooled", "unseen")] == 16
+    assert (found.in_a_row_s > 0).all() and (found.in_a_row_s <= found.train_s).all()
 
 
 def test_steps_and_times_are_counted(grid):

@@ -36,7 +36,7 @@ def simulated(rng, centres, seeds=5, rollouts=100, of_seeds=0.25, of_rollouts=0.
         latent = spread * centre + rng.normal(0, of_seeds, (seeds, 1)) + scene + rng.normal(size=(seeds, rollouts))
         run, seed = np.indices(latent.shape)
         columns = {"run": run.ravel(), "seed": seed.ravel(), "success": latent.ravel() > 0}
-        lines.append(pd.DataFrame({"method": method, "demonstrations": count, "task": "pick", **columns}))
+        lines.append(pd.DataFrame({"method": method, "demonstrations": count, "task": "square", **columns}))
     return pd.concat(lines, ignore_index=True)
 
 

@@ -68,8 +68,8 @@ def success_difference(
 
     Returns:
         n: pairs; difference, low, high; visible: the smallest difference that n pairs with this standard deviation
-        detect with a power of 80 %; only_left, only_right: rollouts that only one of them solved; p_value of
-        McNemar's exact test (McNemar 1947).
+        detect with a power of 80 %, NaN if all pairs agree; only_left, only_right: rollouts that only one of them
+        solved; p_value of McNemar's exact test (McNemar 1947).
     """
     left, right = np.asarray(left, bool), np.asarray(right, bool)
     only_left, only_right = int((left & ~right).sum()), int((right & ~left).sum())  # all that McNemar's test counts
@@ -101,8 +101,8 @@ def mean_difference(
 
 
 def _visible(each: np.ndarray, confidence: float) -> float:
-    spread = float(each.std(ddof=1)) if len(each) > 1 else 0.0
-    return float(sum(norm.ppf([(1 + confidence) / 2, POWER])) * spread / np.sqrt(len(each)))
+    spread = float(each.std(ddof=1)) if len(each) > 1 else np.nan
+    return float(sum(norm.ppf([(1 + confidence) / 2, POWER])) * (spread or np.nan) / np.sqrt(len(each)))
 
 
 def _sign_test(each: np.ndarray, seed: int) -> float:

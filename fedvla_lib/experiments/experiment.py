@@ -44,7 +44,6 @@ def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print, jobs: in
     Raises:
         ValueError: a cell in `out` has other settings or rollouts than the plan's, or was made by other code.
     """
-    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     todo = [cell for cell in plan.cells if not (out / cell.name).exists()]
     for cell in plan.cells:
@@ -57,13 +56,13 @@ def run_plan(plan: Plan, out: Path, say: Callable[[str], None] = print, jobs: in
 
 
 def _check_stored(folder: Path, cell: Cell, plan: Plan) -> None:
-    stamp, stored, asked = run_folder.read_stamp(folder), asdict(run_folder.read_config(folder)), asdict(cell.config)
-    found = {"kind": stamp["kind"], "code": stamp["code"], "rollout_seeds": stamp.get("rollout_seeds"), **stored}
-    wanted = {"kind": cell.kind, "code": methods.trained_by(), "rollout_seeds": _ends(plan.rollout_seeds), **asked}
+    stamp, stored = run_folder.read_stamp(folder), run_folder.read_config(folder)
+    found = {name: stamp.get(name) for name in ("kind", "code", "rollout_seeds")} | provenance.deciding(stored)
+    wanted = {"kind": cell.kind, "code": methods.trained_by(), "rollout_seeds": _ends(plan.rollout_seeds)}
+    wanted |= provenance.deciding(cell.config)
     if other := [name for name in wanted if found[name] != wanted[name]]:
-        name = other[0]
-        text = f"{folder} was made with {name.replace('_', '-')}={found[name]!r}, not {wanted[name]!r}"
-        raise ValueError(f"{text}: give another folder, or move this one away")
+        made = f"{folder} was made with {other[0].replace('_', '-')}={found[other[0]]!r}, not {wanted[other[0]]!r}"
+        raise ValueError(f"{made}: give another folder, or move this one away")
 
 
 def _ends(seeds: Sequence[int]) -> list[int]:
@@ -124,15 +123,19 @@ def _federated(config: Config, seeds: Sequence[int]) -> Measured:
     return replace(
         _measure(methods.federated_policy(config), config, seeds),
         rounds=[event for event in earlier if event["kind"] in ("evaluate", "rollout")],
-        steps={GLOBAL: run_folder.counted_steps(folder)},
-        bytes=_exchanged_bytes(run_folder.read_metrics(folder, "replies")),
-        train_s=run_folder.read_stamp(folder)["wall_s"],
-        in_a_row_s=float(run_folder.read_metrics(folder, "train").groupby("round").seconds.max().sum()),
+        **_costs(folder),
     )
 
 
-def _exchanged_bytes(replies: pd.DataFrame) -> int:
-    return int(replies.sent_bytes.sum() + replies.received_bytes.sum())
+def _costs(run: Path) -> dict[str, Any]:
+    """Return what training a federation cost, as fields of `Measured`; of personal parts, the shared ones' steps."""
+    replies, train = (run_folder.read_metrics(run, kind) for kind in ("replies", "train"))
+    return {
+        "steps": {GLOBAL: run_folder.counted_steps(run)},
+        "bytes": int(replies[replies["to"] != "evaluate"][["sent_bytes", "received_bytes"]].to_numpy().sum()),
+        "train_s": run_folder.read_stamp(run)["wall_s"],
+        "in_a_row_s": float(train.groupby("round").seconds.max().sum()),  # each round waits for its slowest client
+    }
 
 
 def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
@@ -142,10 +145,8 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
         bundle, took_s = _timed(methods.local_only, config, client, progress=False)
         seconds.append(took_s)
         steps[client_name(client)] = methods.counted(config, client)
-        if config.one_task_per_lab:
-            result = _measure(bundle, config, seeds, client)
-        else:
-            result = _measure(bundle, config, seeds[client :: config.num_clients])
+        chosen = seeds if config.one_task_per_lab else seeds[client :: config.num_clients]
+        result = _measure(bundle, config, chosen, client)
         results.append(replace(result, rows=[{**row, "client": client} for row in result.rows]))
     episodes = pd.DataFrame([episode for result in results for episode in result.episodes])
     return Measured(
@@ -160,9 +161,9 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
 
 def _measure(bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: int | None = None) -> Measured:
     """Measure one model on all held-out episodes and all tasks, or in the places of labs with one task each."""
-    in_places = config.one_task_per_lab
-    result = measure.measure(bundle, recordings.open_frames(config), config, seeds=() if in_places else seeds)
-    if in_places:
+    scenes = () if config.one_task_per_lab else seeds
+    result = measure.measure(bundle, recordings.open_frames(config), config, seeds=scenes)
+    if config.one_task_per_lab:
         result = replace(result, rollouts=roll_out_in_places(bundle, config, seeds, trained_in))
     averages = {"num_examples": result.num_examples, **result.averages} if result.episodes else {}
     return Measured(result.rollouts, averages, result.episodes)
@@ -171,16 +172,14 @@ def _measure(bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: i
 def _clients(config: Config, seeds: Sequence[int]) -> Measured:
     """Measure each client's final model, personal parts included, on the client's tasks and held-out episodes."""
     run = methods.federated(replace(config, fraction_evaluate=1.0, client_rollouts=len(seeds)), progress=False)
-    rollouts, evaluated, replies = (run_folder.read_metrics(run, kind) for kind in ("rollout", "evaluate", "replies"))
+    rollouts, evaluated = (run_folder.read_metrics(run, kind) for kind in ("rollout", "evaluate"))
     is_last = (evaluated.who != GLOBAL) & (evaluated["round"] == config.num_server_rounds)
     last = evaluated[is_last & (evaluated.num_examples > 0)]
     return Measured(
         rows=rollouts[rollouts.who != GLOBAL].to_dict("records"),
         held_out={"num_examples": int(last.num_examples.sum()),
                   "loss": float(np.average(last.loss, weights=last.num_examples))},
-        steps={GLOBAL: run_folder.counted_steps(run)},  # of the shared parts; a client's personal parts took fewer
-        bytes=_exchanged_bytes(replies[replies["to"] == "train"]),
-        train_s=run_folder.read_stamp(run)["wall_s"],
+        **_costs(run),
     )  # fmt: skip
 
 

@@ -56,8 +56,8 @@ def nano_base() -> Path:
         if (package / "nano_base" / WEIGHTS_FILE).is_file():
             return package / "nano_base"
     raise ValueError(
-        f"base={NANO!r} was not found and the package {PACKAGE} is not installed: install it on every machine of the "
-        "federation, or give another base"
+        f"the files of the nano base were not found and the package {PACKAGE} is not installed: install it on every "
+        "machine of the federation, or give another base"
     )
 
 

@@ -233,9 +233,6 @@ PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
     "sort": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
         layout.cubes[1], layout.zones_xy_m[1], GRASP_HEIGHT_M
     ),
-    "pile": lambda plan, layout, cube: plan.carry(cube, layout.zones_xy_m[0], GRASP_HEIGHT_M).carry(
-        layout.cubes[1], layout.zones_xy_m[0], STACK_HEIGHT_M
-    ),
     "reach": lambda plan, layout, cube: plan.move((*cube.xy_m, REACH_HEIGHT_M), cube.yaw_rad, OPEN),
     "grip": lambda plan, layout, cube: plan.grasp(cube),
     "drag": lambda plan, layout, cube: plan.grasp(cube, DRAG_HEIGHT_M).arc(
@@ -248,4 +245,4 @@ PLANS: dict[str, Callable[[_Plan, Layout, Cube], _Plan]] = {
     "point_square": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
     "point_circle": lambda plan, layout, cube: plan.point(layout.zones_xy_m[0]),
 }
-PLANS |= {"pick": PLANS["lift"], "square": PLANS["place"], "circle": PLANS["place"], "tower": PLANS["stack"]}
+PLANS |= {"square": PLANS["place"], "tower": PLANS["stack"]}

@@ -15,6 +15,7 @@ CAMERA_SHIFT_M, LOOK_SHIFT_M = 0.010, 0.006  # standard deviations of camera pos
 BRIGHTNESS = (0.8, 1.2)  # range, relative to the reference lab
 TABLE_CHANGE, PAINT_CHANGE = 0.08, 0.05  # largest change of a colour channel in [0, 1]
 OFFSET_DEG = 1.0  # standard deviation of a joint's calibration error
+SPREAD = 0.5  # of the labs that record, which differ less than the scenes that the base is pretrained on
 
 Vector = tuple[float, float, float]
 STILL = ((0.0, 0.0, 0.0),) * len(CAMERAS)
@@ -47,7 +48,7 @@ def labs(count: int) -> list[Lab]:
 
 def _with_operator(k: int) -> Lab:
     rng = np.random.default_rng([0, k])
-    lab = draw_lab(f"lab_{k}", rng)
+    lab = draw_lab(f"lab_{k}", rng, SPREAD)
     return replace(lab, operator=draw_operator(rng))
 
 

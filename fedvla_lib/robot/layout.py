@@ -57,21 +57,17 @@ CUBES_APART_M = 0.058  # minimum distance between cube centres, so that the open
 ZONES_APART_M = 0.10
 
 
-def draw_cubes(
-    regions: Sequence[Region], colors: Sequence[str], rng: np.random.Generator, apart_m: float = CUBES_APART_M
-) -> tuple[Cube, ...]:
+def draw_cubes(regions: Sequence[Region], colors: Sequence[str], rng: np.random.Generator) -> tuple[Cube, ...]:
     """Draw a cube in each region, in the first of these colours."""
-    points = _draw_apart(regions, apart_m, rng)
+    points = _draw_apart(regions, CUBES_APART_M, rng)
     turns_rad = [rng.uniform(-MAX_CUBE_YAW_RAD, MAX_CUBE_YAW_RAD) for _ in points]
     drawn = zip(colors, points, turns_rad, strict=False)  # there may be more colours
     return tuple(Cube(color, cartesian(*point), float(point[1] + turn_rad)) for color, point, turn_rad in drawn)
 
 
-def draw_zones(
-    zones: Sequence[Patch], rng: np.random.Generator, apart_m: float = ZONES_APART_M
-) -> tuple[tuple[float, float], ...]:
+def draw_zones(zones: Sequence[Patch], rng: np.random.Generator) -> tuple[tuple[float, float], ...]:
     """Draw the centre of each zone, x and y in metres."""
-    return tuple(cartesian(*point) for point in _draw_apart([zone.region for zone in zones], apart_m, rng))
+    return tuple(cartesian(*point) for point in _draw_apart([zone.region for zone in zones], ZONES_APART_M, rng))
 
 
 def _draw_apart(regions: Sequence[Region], apart_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:

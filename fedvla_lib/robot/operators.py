@@ -13,7 +13,7 @@ HABITS = {  # smallest and largest value of each habit
     "speed": (0.8, 1.25),
     "hover_m": (-0.010, 0.020),
     "side_m": (-0.025, 0.025),
-    "grasp_m": (-0.004, 0.004),
+    "grasp_m": (-0.002, 0.002),
     "hesitation": (0.0, 0.4),
     "correction": (0.0, 0.3),
     "imperfect": (0.0, 0.3),

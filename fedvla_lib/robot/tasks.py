@@ -7,11 +7,10 @@ the table under the arm's first joint, x points away from the base, y to the arm
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from fedvla_lib.robot import layout
 from fedvla_lib.robot.layout import COLORS, CUBE_HALF_M, Layout, Patch, Region, draw_cubes, draw_zones
 
 LIFT_CLEARANCE_M = 0.04  # a held cube higher above the table than this is lifted
@@ -63,8 +62,6 @@ class Task:
     other: Region | None = None  # where a second cube of another colour stands
     other_share: float = 1.0  # fraction of episodes with the second cube
     zones: tuple[Patch, ...] = ()
-    # Minimum distance between centres: of cubes, of zones, of a cube and a zone.
-    apart_m: tuple[float, float, float] = (layout.CUBES_APART_M, layout.ZONES_APART_M, 0.0)
 
 
 def _placed(state: TaskState) -> bool:
@@ -79,10 +76,6 @@ def _in_circle(state: TaskState) -> bool:
     return float(np.hypot(*state.zone_offset_m)) < PUSH_RADIUS_M - CUBE_HALF_M
 
 
-def _circled(state: TaskState) -> bool:
-    return state.carried and _in_circle(state) and _released(state) and _at_rest(state)
-
-
 def _pushed(state: TaskState) -> bool:
     return _in_circle(state) and _slid(state) and not state.carried and not state.flung and _at_rest(state)
 
@@ -93,11 +86,6 @@ def _stacked(state: TaskState) -> bool:
     on_top = np.hypot(x, y) < CUBE_HALF_M and abs(z - 2 * CUBE_HALF_M) < REST_CLEARANCE_M
     still = state.speed_mps < REST_SPEED_MPS and _at_rest(below) and not below.touched
     return bool(state.carried and on_top and _released(state) and still)
-
-
-def _piled(state: TaskState) -> bool:
-    (upper,) = state.others
-    return _in_square(state) and state.carried and _stacked(replace(upper, others=(state,)))
 
 
 def _reached(state: TaskState) -> bool:
@@ -161,23 +149,14 @@ TASKS = _by_name(
                 Patch(Region((0.19, 0.21), (-46.0, -36.0)), "disc", PUSH_RADIUS_M))),
 )  # fmt: skip
 
-# The five tasks of the benchmark "ten labs": in each two cubes, a square and a circle anywhere on the table, so that
-# only the instruction tells which cube goes where; *pile* takes two steps. Zones are no larger than those that the base
-# has seen, and stand off from the cubes: beside larger or nearer ones it finds a named cube half as often.
-_CUBES = Region((0.185, 0.23), (-20.0, 20.0))
-_ZONES = Region((0.185, 0.225), (-44.0, 44.0))
-_SQUARE, _CIRCLE = Patch(_ZONES, "square", PLACE_HALF_M), Patch(_ZONES, "disc", PUSH_RADIUS_M)
-_LAB = {"cube": _CUBES, "other": _CUBES, "zones": (_SQUARE, _CIRCLE), "apart_m": (0.07, 0.11, 0.08)}
+# The tasks of the benchmark "ten labs", on one table: only the instruction tells where the cube goes.
+_TABLE = {"cube": Region((0.19, 0.225), (-25.0, -5.0)), "other": Region((0.19, 0.225), (4.0, 17.0)),
+          "zones": (Patch(Region((0.19, 0.215), (36.0, 45.0)), "square", PLACE_HALF_M),)}  # fmt: skip
 LAB_TASKS = _by_name(
-    Task("pick", ("Pick up the {color} cube.",), TASKS["lift"].success, hold_steps=5, horizon_steps=75, **_LAB),
-    Task("square", ("Move the {color} cube to the yellow square.",), _placed, hold_steps=4,
-         horizon_steps=120, **_LAB),
-    Task("circle", ("Move the {color} cube to the white circle.",), _circled, hold_steps=4, horizon_steps=120,
-         **_LAB | {"zones": (_CIRCLE, _SQUARE)}),
+    Task("square", ("Move the {color} cube to the yellow square.",), _placed, hold_steps=4, horizon_steps=120,
+         **_TABLE),
     Task("tower", ("Put the {color} cube on top of the {other} cube.",), _stacked, hold_steps=4, horizon_steps=120,
-         **_LAB),
-    Task("pile", ("Move the {color} cube to the yellow square, then put the {other} cube on top of it.",), _piled,
-         hold_steps=4, horizon_steps=230, **_LAB),
+         **_TABLE),
 )  # fmt: skip
 
 ANYWHERE = Region((0.185, 0.23), (-30.0, 30.0))
@@ -242,10 +221,6 @@ def draw_layout(task: Task, rng: np.random.Generator, color: str | None = None) 
     drawn = [str(name) for name in rng.permutation(list(COLORS))]
     colors = sorted(drawn, key=lambda name: name != color)  # stable: the others stay in the order drawn
     regions = [task.cube, *([task.other] if task.other and rng.random() < task.other_share else [])]
-    cubes_m, zones_m, between_m = task.apart_m
-    while True:
-        cubes, zones_xy_m = draw_cubes(regions, colors, rng, cubes_m), draw_zones(task.zones, rng, zones_m)
-        if all(np.hypot(*np.subtract(cube.xy_m, zone)) >= between_m for cube in cubes for zone in zones_xy_m):
-            break
+    cubes, zones_xy_m = draw_cubes(regions, colors, rng), draw_zones(task.zones, rng)
     wording = task.wordings[rng.integers(len(task.wordings))]
     return Layout(wording.format(color=colors[0], other=colors[1]), cubes, zones_xy_m)

@@ -59,7 +59,14 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
     mean, (parts, freedom) = values.to_numpy(float).mean(), _mean_squares(values)
     variance = max(parts[0] + parts[1] - parts[2], parts[2] / 2)  # an estimate near or below 0 is chance
     if variance == 0:
-        return {"difference": mean, "low": mean, "high": mean, "p_value": float(mean == 0), "df": np.inf, "visible": 0}
+        return {
+            "difference": mean,
+            "low": mean,
+            "high": mean,
+            "p_value": float(mean == 0),
+            "df": np.inf,
+            "visible": np.nan,
+        }
     df = max(variance**2 / np.divide(parts**2, freedom, out=np.zeros(3), where=freedom > 0).sum(), seeds - 1)
     error, reach = np.sqrt(variance / (seeds * rollouts)), t.ppf(1 - (1 - confidence) / 2, df)
     return {

@@ -8,12 +8,13 @@ import pandas as pd
 
 from fedvla_book.tables.intervals import success_interval
 from fedvla_lib import run_folder
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, task_names
 from fedvla_lib.run_folder import GLOBAL
 
-OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes", "train_s")
+OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes")
 # Settings that determine the demonstrations and which of them are held out.
-RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "val_fraction")
+RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "one_task_per_lab", "val_fraction")
+OWN = "own"  # place of a rollout at a lab's own task in that lab
 PARALLEL = ("federated", "clients")  # kinds whose clients train in parallel
 LOCAL_ONLY = "local-only"
 HELD_OUT = ("loss", "action_error")
@@ -22,9 +23,11 @@ HELD_OUT = ("loss", "action_error")
 def read_results(folder: Path) -> pd.DataFrame:
     """Return a row for each rollout of the last model of each cell in `folder`, with columns that describe the cell.
 
-    train_s is NaN if the stamp has no training time. steps_in_all and steps_in_a_row are gradient steps of the model
-    that made the rollout. `counted` tells whether they were counted while training; for older cells they are derived
-    from the settings, and a local-only client gets its share of the total.
+    train_s and in_a_row_s are NaN if the stamp lacks them. demonstrations counts those of one lab. place is where
+    a rollout was made: own, unseen or others (`evaluation.rollouts.roll_out_in_places`); own where no lab has a task of
+    its own. steps_in_all and steps_in_a_row are gradient steps of the model that made the rollout. `counted` tells
+    whether they were counted while training; for older cells they are derived from the settings, and a local-only
+    client gets its share of the total.
 
     Raises:
         ValueError: there is no result.
@@ -44,8 +47,8 @@ def cell_folders(folder: Path) -> Iterator[Path]:
 def cell_columns(cell: Path) -> dict[str, Any]:
     """Return what a cell's stamp says of it, by the name of the column."""
     stamp = run_folder.read_stamp(cell)
-    train_s = float("nan") if stamp["train_s"] is None else stamp["train_s"]
-    return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], "train_s": train_s}
+    seconds = {key: float("nan") if stamp.get(key) is None else stamp[key] for key in ("train_s", "in_a_row_s")}
+    return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], **seconds}
 
 
 def _rollouts(cell: Path) -> pd.DataFrame:
@@ -55,8 +58,11 @@ def _rollouts(cell: Path) -> pd.DataFrame:
     config = run_folder.read_config(cell)
     recording = ", ".join(str(getattr(config, name)) for name in RECORDING)
     rows = rows[rows["round"] == last["round"]]
+    demonstrations = config.episodes_per_task * len(task_names(config)) / config.num_labs
+    place = rows["place"] if "place" in rows else OWN
     steps = _steps(run_folder.read_stamp(cell), config, rows)
-    return rows.assign(**cell_columns(cell), **measured, **steps, recording=recording)
+    of_cell = cell_columns(cell) | measured | {"recording": recording, "demonstrations": demonstrations}
+    return rows.assign(place=place, **of_cell, **steps)
 
 
 def _steps(stamp: dict[str, Any], config: Config, rows: pd.DataFrame) -> dict[str, Any]:
@@ -93,5 +99,6 @@ def summary(rows: pd.DataFrame, by: Sequence[str] = ("partition", "method")) -> 
             "steps_in_all": part.steps_in_all.mean(), "steps_in_a_row": part.steps_in_a_row.mean(),
             "counted": bool(part.counted.all()), "gradient_steps": cells.gradient_steps.mean(),
             "samples": cells.samples.mean(), "MB": cells.bytes.mean() / 1e6, "train_s": cells.train_s.mean(),
+            "in_a_row_s": cells.in_a_row_s.mean(),
         })  # fmt: skip
     return pd.DataFrame(lines)
