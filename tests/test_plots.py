@@ -315,6 +315,17 @@ def test_success_by_bytes_sets_points_of_equal_bytes_apart():
     np.testing.assert_allclose(left * right, 600**2)
 
 
+def test_success_by_demonstrations_draws_a_line_per_method_over_a_log_axis():
+    counts, methods = [1, 2, 4], ["local-only", "centralized"]
+    rates = {"success_rate": [0.1, 0.2, 0.4, 0.5, 0.6, 0.9], "low": 0.05, "high": 0.95}
+    table = pd.DataFrame({"method": np.repeat(methods, 3), "demonstrations": counts * 2, **rates})
+    ax = plots.success_by_demonstrations(table.sample(frac=1.0, random_state=0).sort_values("method", kind="stable"))
+    assert labelled(ax) and ax.get_xscale() == "log" and ax.get_xlim()[0] > 0
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == sorted(methods)
+    np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata()[:, 1], [10, 20, 40])  # in the order of demonstrations
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["1", "2", "4"]
+
+
 def checkpoint_table():
     return pd.DataFrame(
         {"method": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],

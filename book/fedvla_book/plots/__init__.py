@@ -41,6 +41,7 @@ from fedvla_book.plots.success_rates import (
     rollout_grid,
     success_bars,
     success_by_bytes,
+    success_by_demonstrations,
     success_intervals,
     success_per_megabyte,
 )
@@ -101,6 +102,7 @@ __all__ = [
     "rollout_grid",
     "success_bars",
     "success_by_bytes",
+    "success_by_demonstrations",
     "success_intervals",
     "success_per_megabyte",
     "trainable_bars",

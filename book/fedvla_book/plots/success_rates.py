@@ -105,6 +105,27 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
     return ax
 
 
+def success_by_demonstrations(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
+    """Draw success rate against demonstrations per lab, a line per method.
+
+    Args:
+        table: columns method, demonstrations, success_rate, low, high.
+    """
+    ax = ax or new_axes()
+    for i, (method, part) in enumerate(table.groupby("method", sort=False)):
+        part, color = part.sort_values("demonstrations"), method_color(method, i)
+        places = part.demonstrations * 1.03 ** (i - 1)  # so that no interval hides another
+        ax.errorbar(places, 100 * part.success_rate, yerr=100 * to_ends(part), fmt="o-", capsize=3, color=color,
+                    label=method)  # fmt: skip
+    ax.set_xscale("log", base=2)
+    ax.set_xticks(counts := sorted(table.demonstrations.unique()), [f"{count:g}" for count in counts])
+    ax.set_ylim(-2, 102)
+    ax.set_xlabel("demonstrations in each lab (log scale)")
+    ax.set_ylabel("success rate [%], 95 % interval")
+    ax.legend(frameon=False)
+    return ax
+
+
 def success_by_bytes(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Draw success rate against exchanged MB, a point per row; columns method, MB, success_rate, low, high.
 
