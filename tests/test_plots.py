@@ -322,7 +322,7 @@ def test_success_by_demonstrations_draws_a_line_per_method_over_a_log_axis():
     ax = plots.success_by_demonstrations(table.sample(frac=1.0, random_state=0).sort_values("method", kind="stable"))
     assert labelled(ax) and ax.get_xscale() == "log" and ax.get_xlim()[0] > 0
     assert [text.get_text() for text in ax.get_legend().get_texts()] == sorted(methods)
-    np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata()[:, 1], [10, 20, 40])  # in the order of demonstrations
+    np.testing.assert_allclose(ax.containers[1].lines[0].get_xydata()[:, 1], [10, 20, 40])  # in their order
     assert [label.get_text() for label in ax.get_xticklabels()] == ["1", "2", "4"]
 
 

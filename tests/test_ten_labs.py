@@ -102,6 +102,18 @@ def test_the_book_reads_demonstrations_place_and_time(grid):
     assert (found.in_a_row_s > 0).all() and (found.in_a_row_s <= found.train_s).all()
 
 
+def test_the_loss_is_of_fresh_demonstrations_of_the_same_labs(grid):
+    fresh = recordings.open_frames(from_profile("tiny", **SETTINGS, seed=10_000))
+    pooled, alone = (
+        run_folder.read_metrics(grid / "out" / f"lab_{name}_0", "held-out") for name in ("pooled", "alone")
+    )
+    assert len(fresh.episodes) == 8  # two for each lab
+    for measured in (pooled, alone):
+        assert sorted(measured.episode_id) == sorted(fresh.episodes.episode_id) and (measured.loss > 0).all()
+    assert (pooled.num_examples == alone.num_examples).all()
+    assert read_results(grid / "out").loss.notna().all()
+
+
 def test_steps_and_times_are_counted(grid):
     stamps = {name: run_folder.read_stamp(grid / "out" / f"lab_{name}_0") for name in ("averaged", "alone", "pooled")}
     assert stamps["averaged"]["steps"]["global"] == {"in_all": 16, "in_a_row": 4}  # 2 rounds, 4 labs, 2 local steps

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from fedvla_lib import files, provenance, run_folder
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, task_names
 from fedvla_lib.data import recordings
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import roll_out_in_places, success_rate
@@ -21,6 +21,9 @@ from fedvla_lib.federation.nodes import client_name
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 from fedvla_lib.workers import side_by_side
+
+FRESH_SEED = 10_000  # added to the seed of a recording, for another one in the same labs
+FRESH_PER_LAB = 2  # its demonstrations in each lab
 
 
 @dataclass(frozen=True)
@@ -160,11 +163,18 @@ def _local_only(config: Config, seeds: Sequence[int]) -> Measured:
 
 
 def _measure(bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: int | None = None) -> Measured:
-    """Measure one model on all held-out episodes and all tasks, or in the places of labs with one task each."""
-    scenes = () if config.one_task_per_lab else seeds
-    result = measure.measure(bundle, recordings.open_frames(config), config, seeds=scenes)
+    """Measure one model on all held-out episodes and all tasks, or in the places of labs with one task each.
+
+    Such labs have few demonstrations and hold none out: the model is measured on fresh ones of theirs.
+    """
     if config.one_task_per_lab:
+        count = FRESH_PER_LAB * config.num_labs // len(task_names(config))
+        store = recordings.open_frames(replace(config, seed=config.seed + FRESH_SEED, episodes_per_task=count))
+        table = store.episodes if trained_in is None else store.episodes.query("lab == @trained_in")
+        result = measure.measure(bundle, store, config, episode_ids=table.episode_id.tolist())
         result = replace(result, rollouts=roll_out_in_places(bundle, config, seeds, trained_in))
+    else:
+        result = measure.measure(bundle, recordings.open_frames(config), config, seeds=seeds)
     averages = {"num_examples": result.num_examples, **result.averages} if result.episodes else {}
     return Measured(result.rollouts, averages, result.episodes)
 
