@@ -93,34 +93,16 @@ def test_what_an_operator_does_follows_from_the_seed():
     assert len(one) != len(other) or (one != other).any()
 
 
-def test_the_ten_labs_tasks_share_one_table_so_that_the_instruction_decides():
-    """Two cubes and the square stand apart from each other in every layout, the same for every task of a seed."""
-    envs = [So100Env(task, cameras=(), render_mode=None) for task in LAB_TASKS.values()]
+def test_the_scene_tells_the_ten_labs_task_and_the_instruction_the_cube():
+    square, tower = (So100Env(task, cameras=(), render_mode=None) for task in ("square", "tower"))
+    asked = set()
     for seed in range(40):
-        for env in envs:
-            env.reset(seed=seed)
-        one, other = (env.layout for env in envs)
-        assert (one.cubes, one.zones_xy_m) == (other.cubes, other.zones_xy_m)
-        assert one.instruction != other.instruction
-        cubes, (zone,) = np.array([cube.xy_m for cube in one.cubes]), np.array(one.zones_xy_m)
-        assert np.linalg.norm(cubes[0] - cubes[1]) >= 0.058 and np.linalg.norm(cubes - zone, axis=1).min() >= 0.06
-
-
-def end_after(asked, done, seed=0):
-    """Let the expert do a task other than the one asked for, and return whether that counted as a success."""
-    env, expert = So100Env(asked, cameras=(), render_mode=None), Expert()
-    env.reset(seed=seed)
-    env.task = done
-    expert.reset(env, seed)
-    env.task = asked
-    terminated = truncated = False
-    while not (terminated or truncated):
-        *_, terminated, truncated, _ = env.step(expert.act({}))
-    return terminated
-
-
-@pytest.mark.parametrize("asked", sorted(LAB_TASKS))
-def test_only_what_was_asked_counts(asked):
-    """In the layout of a task its own expert succeeds, and that of a task with another goal does not."""
-    assert end_after(asked, asked)
-    assert not any(end_after(asked, done) for done in LAB_TASKS if done != asked)
+        square.reset(seed=seed)
+        tower.reset(seed=seed)
+        asked |= {square.instruction, tower.instruction}
+        (cube,), (zone,) = square.layout.cubes, square.layout.zones_xy_m
+        one, other = tower.layout.cubes
+        assert not tower.layout.zones_xy_m
+        for left, right in ((cube.xy_m, zone), (one.xy_m, other.xy_m)):
+            assert np.linalg.norm(np.subtract(left, right)) >= 0.058
+    assert len(asked) == 3 + 6  # colours of one cube, and of two

@@ -149,14 +149,13 @@ TASKS = _by_name(
                 Patch(Region((0.19, 0.21), (-46.0, -36.0)), "disc", PUSH_RADIUS_M))),
 )  # fmt: skip
 
-# The tasks of the benchmark "ten labs", on one table: only the instruction tells where the cube goes.
-_TABLE = {"cube": Region((0.19, 0.225), (-25.0, -5.0)), "other": Region((0.19, 0.225), (4.0, 17.0)),
-          "zones": (Patch(Region((0.19, 0.215), (36.0, 45.0)), "square", PLACE_HALF_M),)}  # fmt: skip
+# The tasks of the benchmark "ten labs": the scene tells which of them it is, the instruction which cube to move.
 LAB_TASKS = _by_name(
     Task("square", ("Move the {color} cube to the yellow square.",), _placed, hold_steps=4, horizon_steps=120,
-         **_TABLE),
+         cube=Region((0.19, 0.225), (-25.0, -5.0)),
+         zones=(Patch(Region((0.19, 0.22), (18.0, 45.0)), "square", PLACE_HALF_M),)),
     Task("tower", ("Put the {color} cube on top of the {other} cube.",), _stacked, hold_steps=4, horizon_steps=120,
-         **_TABLE),
+         cube=Region((0.19, 0.225), (-25.0, -5.0)), other=Region((0.19, 0.22), (8.0, 30.0))),
 )  # fmt: skip
 
 ANYWHERE = Region((0.185, 0.23), (-30.0, 30.0))
