@@ -93,7 +93,7 @@ def test_what_an_operator_does_follows_from_the_seed():
     assert len(one) != len(other) or (one != other).any()
 
 
-def test_the_scene_tells_the_ten_labs_task_and_the_instruction_the_cube():
+def test_the_scene_tells_the_ten_labs_task_and_colours_vary():
     square, tower = (So100Env(task, cameras=(), render_mode=None) for task in ("square", "tower"))
     asked = set()
     for seed in range(40):

@@ -149,7 +149,7 @@ TASKS = _by_name(
                 Patch(Region((0.19, 0.21), (-46.0, -36.0)), "disc", PUSH_RADIUS_M))),
 )  # fmt: skip
 
-# The tasks of the benchmark "ten labs": the scene tells which of them it is, the instruction which cube to move.
+# The tasks of the benchmark "ten labs": the scene tells which of them it is.
 LAB_TASKS = _by_name(
     Task("square", ("Move the {color} cube to the yellow square.",), _placed, hold_steps=4, horizon_steps=120,
          cube=Region((0.19, 0.225), (-25.0, -5.0)),

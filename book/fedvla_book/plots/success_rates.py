@@ -117,8 +117,9 @@ def success_by_demonstrations(table: pd.DataFrame, *, ax: Axes | None = None) ->
         places = part.demonstrations * 1.03 ** (i - 1)  # so that no interval hides another
         ax.errorbar(places, 100 * part.success_rate, yerr=100 * to_ends(part), fmt="o-", capsize=3, color=color,
                     label=method)  # fmt: skip
+    counts = sorted(table.demonstrations.unique())
     ax.set_xscale("log", base=2)
-    ax.set_xticks(counts := sorted(table.demonstrations.unique()), [f"{count:g}" for count in counts])
+    ax.set_xticks(counts, [f"{count:g}" for count in counts])
     ax.set_ylim(-2, 102)
     ax.set_xlabel("demonstrations in each lab (log scale)")
     ax.set_ylabel("success rate [%], 95 % interval")

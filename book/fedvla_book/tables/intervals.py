@@ -48,7 +48,7 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
 
     Returns:
         difference (the mean), low, high, p_value (of a mean of 0), df, and visible: the smallest mean that is
-        distinguished from 0 with a power of 80 %.
+        distinguished from 0 with a power of 80 %, NaN if all values are equal.
 
     Raises:
         ValueError: fewer than two training seeds.
@@ -59,14 +59,8 @@ def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str
     mean, (parts, freedom) = values.to_numpy(float).mean(), _mean_squares(values)
     variance = max(parts[0] + parts[1] - parts[2], parts[2] / 2)  # an estimate near or below 0 is chance
     if variance == 0:
-        return {
-            "difference": mean,
-            "low": mean,
-            "high": mean,
-            "p_value": float(mean == 0),
-            "df": np.inf,
-            "visible": np.nan,
-        }
+        certain = {"difference": mean, "low": mean, "high": mean, "p_value": float(mean == 0)}
+        return certain | {"df": np.inf, "visible": np.nan}
     df = max(variance**2 / np.divide(parts**2, freedom, out=np.zeros(3), where=freedom > 0).sum(), seeds - 1)
     error, reach = np.sqrt(variance / (seeds * rollouts)), t.ppf(1 - (1 - confidence) / 2, df)
     return {

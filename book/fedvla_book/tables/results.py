@@ -23,10 +23,10 @@ HELD_OUT = ("loss", "action_error")
 def read_results(folder: Path) -> pd.DataFrame:
     """Return a row for each rollout of the last model of each cell in `folder`, with columns that describe the cell.
 
-    train_s and in_a_row_s are NaN if the stamp lacks them. demonstrations counts those of one lab. place is where
-    a rollout was made: own, unseen or others (`evaluation.rollouts.roll_out_in_places`); own where no lab has a task of
-    its own. steps_in_all and steps_in_a_row are gradient steps of the model that made the rollout. `counted` tells
-    whether they were counted while training; for older cells they are derived from the settings, and a local-only
+    train_s and in_a_row_s are NaN if the stamp lacks them. demonstrations: how many the settings ask of each lab. place
+    is where a rollout was made: own, unseen or others (`evaluation.rollouts.roll_out_in_places`); own where no lab has
+    a task of its own. steps_in_all and steps_in_a_row are gradient steps of the model that made the rollout. `counted`
+    tells whether they were counted while training; for older cells they are derived from the settings, and a local-only
     client gets its share of the total.
 
     Raises:
