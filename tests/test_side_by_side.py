@@ -108,6 +108,6 @@ def test_cells_of_an_experiment(recording, tmp_path, monkeypatch):
         experiment.run_plan(plan, tmp_path / str(jobs), say=lines.append, jobs=jobs)
         found = results.read_results(tmp_path / str(jobs))
         tables.append(found.sort_values(list(found.columns[:6])).reset_index(drop=True))
-    varying = [name for name in tables[0] if name in ("time", "train_s", "seconds")]
+    varying = [name for name in tables[0] if name in ("time", "train_s", "seconds", "in_a_row_s")]
     pd.testing.assert_frame_equal(*(table.drop(columns=varying) for table in tables))
     assert sum(line.startswith("[4/4]") for line in lines) == 2
