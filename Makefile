@@ -4,6 +4,7 @@
 # make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make check-zip   every chapter as a reader of the zip runs it (make test does it too)
+# make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
@@ -12,7 +13,7 @@
 # share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS (chapters that
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
 .DEFAULT_GOAL := help
-.PHONY: help env book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
+.PHONY: help env address book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -105,6 +106,10 @@ pdf: $(STAMP)
 
 new-chapter: $(STAMP)
 	@$(BIN)/python book/tools/new_chapter.py "$(NAME)"
+
+# With it, the book gets its buttons and whole addresses. PAGES_URL: where the book is, if not where GitHub puts it.
+address: $(STAMP)
+	@$(BIN)/python book/tools/set_address.py "$(URL)" $(if $(PAGES_URL),--pages "$(PAGES_URL)")
 
 lab: $(STAMP)
 	cd notebooks && ../$(BIN)/jupyter lab

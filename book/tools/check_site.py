@@ -12,17 +12,19 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from shutil import which
 from urllib.parse import unquote, urljoin, urlparse
 
+import yaml
 from axe_playwright_python.sync_playwright import Axe
 from bs4 import BeautifulSoup
 from playwright.sync_api import Browser, Page, sync_playwright
 from tqdm import tqdm
 
+ROOT = Path(__file__).resolve().parents[2]
 NARROW = {"width": 360, "height": 740}  # pixels of a small phone
 WIDE = {"width": 1280, "height": 900}
 SEARCHED = "FedAvg"
@@ -39,8 +41,8 @@ BROWSERS = 2  # in parallel; each uses a core
 Check = Callable[[Page, str], list[str]]
 SHORT_ALT = 12  # characters; shorter alternative texts do not describe a figure
 
-# JavaScript functions that return a list of problems of the page.
-FIGURES = """() => [...document.querySelectorAll('main img')].flatMap(img => {
+# JavaScript functions that return a list of problems of the page. Pictures on the theme's buttons are no figures.
+FIGURES = """() => [...document.querySelectorAll('main img:not(.bd-header-article img)')].flatMap(img => {
   const name = img.currentSrc.split('/').pop().slice(0, 60);
   if (img.complete && img.naturalWidth === 0) return [`image ${name} does not load`];
   const alt = (img.getAttribute('alt') || '').trim();
@@ -61,8 +63,19 @@ DARK_FIGURES = """() => [...document.querySelectorAll('main .cell_output img')].
 })"""
 
 
+@cache
+def prefix() -> str:
+    """Return the folder below which 404.html expects the site, since it is shown for any address: / or /REPOSITORY/."""
+    config = yaml.safe_load((ROOT / "_config.yml").read_text(encoding="utf-8"))
+    return config["sphinx"]["config"]["notfound_urls_prefix"]
+
+
 class Quiet(SimpleHTTPRequestHandler):
-    """Request handler without log messages."""
+    """Request handler without log messages; the site is at the root and in the folder where it expects to be."""
+
+    def translate_path(self, path: str) -> str:
+        """Return the file of an address."""
+        return super().translate_path("/" + path.removeprefix(prefix()))
 
     def log_message(self, *_: object) -> None:
         """Print nothing."""
@@ -112,7 +125,8 @@ def dead_links(folder: Path, page: str, site: dict[str, Facts]) -> list[str]:
         target = urlparse(urljoin(page, href)) if not href.startswith("#") else urlparse(page + href)
         if target.scheme or target.netloc or href in ("", "#"):
             continue
-        path, anchor = unquote(target.path).lstrip("/"), unquote(target.fragment)  # 404.html links from the root
+        path = unquote(target.path).removeprefix(prefix()).lstrip("/")  # 404.html links from the root
+        anchor = unquote(target.fragment)
         if not (folder / path).is_file():
             found.append(f"links to {href}, which does not exist")
         elif anchor and path in site and anchor not in site[path].anchors:

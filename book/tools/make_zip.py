@@ -20,6 +20,7 @@ TARGET = "_build/fedvla-book.zip"
 # Same layout as the checkout: chapters read ../book/reference.
 PACKED = ["notebooks/*.ipynb", "book/reference/**/*", "requirements.lock", "LICENSE"]
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+# --no-deps: the lock is whole but for what `override-dependencies` in pyproject.toml leaves out, which pip would miss.
 README = """{title}
 
 The notebooks of the book, the stored results that they read, and the packages that they import. Needs Python {python}.
@@ -27,7 +28,7 @@ The notebooks of the book, the stored results that they read, and the packages t
 Install, in this folder:
 
     python3 -m venv .venv
-    .venv/bin/python -m pip install --require-hashes -r requirements.lock
+    .venv/bin/python -m pip install --no-deps --require-hashes -r requirements.lock
     .venv/bin/python -m pip install --no-deps {wheel}
 
 Check the machine, record the demonstrations (minutes), and start with chapter 1:

@@ -1,9 +1,10 @@
 """Sphinx extension of the book.
 
 It removes unused scripts, numbers equations, fixes the ARIA roles of the bibliography, links the library's functions to
-the chapters that use them, and completes the single page that is printed.
+the chapters that use them, lets Colab open copies of the chapters, and completes the single page that is printed.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from sphinx.application import Sphinx
 import library
 
 UNUSED = "thebe"  # Jupyter Book always loads it, and declares its constants twice
+COLAB_BRANCH = "colab"  # holds the copies of colab.py; .github/workflows/pages.yml writes it
 
 
 def without_unused(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object) -> None:
@@ -28,6 +30,13 @@ def with_list_items(app: Sphinx, page: str, template: str, context: dict[str, An
     """
     if "body" in context:  # the index and the search have none
         context["body"] = context["body"].replace('role="doc-biblioentry"', 'role="listitem"')
+
+
+def with_colab_copies(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object) -> None:
+    """Let the button for Colab open the copy of a chapter, whose first cell installs the library."""
+    for button in (one for group in context.get("header_buttons", []) for one in group.get("buttons", [])):
+        if button.get("text") == "Colab":
+            button["url"] = re.sub(r"/blob/[^/]+/", f"/blob/{COLAB_BRANCH}/", button["url"])
 
 
 def number_equations(app: Sphinx, doctree: nodes.document) -> None:
@@ -74,6 +83,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("doctree-read", number_equations)
     app.connect("html-page-context", without_unused, priority=900)
     app.connect("html-page-context", with_list_items)
+    app.connect("html-page-context", with_colab_copies, priority=900)  # after the theme, which makes the buttons
     app.connect("builder-inited", complete_single_page)
     app.connect("builder-inited", link_to_chapters)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
