@@ -63,20 +63,25 @@ def test_what_a_build_measured_is_kept_and_shown(tmp_path):
     chapters = "".join(f"- file: notebooks/{name}\n" for name in ("01_a", "02_b"))
     (tmp_path / "_toc.yml").write_text(f"format: jb-book\nroot: a\nchapters:\n{chapters}")
     (tmp_path / "notebooks").mkdir()
-    for name in ("01_a", "02_b"):
-        (tmp_path / "notebooks" / f"{name}.ipynb").touch()
+    text = v4.new_notebook(cells=[v4.new_markdown_cell("word " * 1000)])
+    for name in ("01_a", "02_b", "03_c"):
+        nbformat.write(text, tmp_path / "notebooks" / f"{name}.ipynb")
     folder = tmp_path / "_build" / "tiny" / "executed"
     executed(folder, "01_a")
     with pytest.raises(ValueError, match=r"not executed at profile tiny: 02_b"):
         keep_costs.keep(tmp_path, "tiny")
     executed(folder, "02_b", said=False)
     kept = keep_costs.keep(tmp_path, "tiny")
-    shown = chapter_cost.measured("01_a", kept.parent)
+
+    def box(chapter):
+        return chapter_cost.measured(chapter, kept.parent, tmp_path / "notebooks")
+
+    shown = box("01_a")
     assert shown.loc["tiny", "time [s]"] == "8" and float(shown.loc["tiny", "memory [MB]"].replace(",", "")) > 10
-    assert set(shown.loc["laptop"]) == {"–"}
+    assert set(shown.loc["laptop"]) == {5, "–"}, "five minutes of reading"
     assert shown.to_html().split("</thead>")[0].count("<tr") == 1, "one row of heads, in a small box"
-    assert chapter_cost.measured("02_b", kept.parent).loc["tiny"].tolist()[:3] == ["8", "–", "–"]
-    assert set(chapter_cost.measured("03_c", kept.parent).to_numpy().ravel()) == {"–"}
+    assert box("02_b").loc["tiny"].tolist()[:4] == [5, "8", "–", "–"]
+    assert set(box("03_c").to_numpy().ravel()) == {5, "–"}
 
 
 def test_a_copy_that_no_build_made_is_refused(tmp_path):

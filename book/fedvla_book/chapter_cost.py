@@ -2,7 +2,7 @@
 
 ``python book/tools/keep_costs.py --profile laptop`` stores the costs of an executed build. Time is that of the whole
 chapter; memory is the peak of its process without Flower's processes; exchanged is what server and clients of its
-federations sent, in both directions.
+federations sent, in both directions. Reading is without exercises and quiz, at the speed of `reading.minutes`.
 """
 
 import json
@@ -16,10 +16,12 @@ from typing import Any
 
 import pandas as pd
 
+from fedvla_book import reading
 from fedvla_lib import run_folder
 from fedvla_lib.config import PROFILES
 
 KEPT = Path("../book/reference/costs")  # relative to notebooks/; a file per profile
+CHAPTERS = Path("../notebooks")
 MEASURED = "fedvla_cost"  # key in the metadata of the output
 
 
@@ -68,9 +70,10 @@ def peak_memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def measured(chapter: str, folder: Path = KEPT) -> pd.DataFrame:
+def measured(chapter: str, folder: Path = KEPT, chapters: Path = CHAPTERS) -> pd.DataFrame:
     """Return the stored costs of a chapter such as ``01_data``, a row per profile; a dash is what was not measured."""
-    rows = {profile: _stored(folder / f"{profile}.json", chapter) for profile in PROFILES}
+    read = {"reading [min]": reading.minutes(chapters / f"{chapter}.ipynb")}
+    rows = {profile: read | _stored(folder / f"{profile}.json", chapter) for profile in PROFILES}
     return pd.DataFrame(rows).T.rename_axis(columns="this chapter takes")  # a named index would add a header row
 
 

@@ -1,4 +1,7 @@
-"""Shared by chapters: the checklist of a federated run, ticked by tests, and the display of library source."""
+"""Shared by chapters: the steps of a federated run that a chapter has tested, and the display of library source.
+
+The nine steps stand, each with what it means, in ``book/how_to_read.md``.
+"""
 
 import inspect
 from collections.abc import Callable
@@ -7,35 +10,27 @@ from typing import Any
 
 from IPython.display import Markdown
 
-STEPS = {
-    "environment": "dependencies are installed at known versions",
-    "model": "the policy loads, and only the intended parameters train",
-    "data": "episodes are complete, and no episode is in two splits",
-    "configuration": "all settings are known and in range",
-    "training": "local steps change the weights and lower the loss",
-    "parameters": "exchanged arrays are complete, validated and bit-identical to what was sent",
-    "communication": "messages arrive, and their bytes are counted",
-    "global_update": "the server's average is the intended one",
-    "validation": "the model is evaluated on data that no client trained on",
-}
+STEPS = (
+    "environment", "model", "data", "configuration", "training", "parameters", "communication", "global_update",
+    "validation",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Checklist:
-    """The tested steps, shown as a list with ticks."""
+    """The tested steps, shown as one line."""
 
     tested: frozenset[str]
 
     def _repr_markdown_(self) -> str:
-        marks = {step: "☑" if step in self.tested else "☐" for step in STEPS}
-        return "\n".join(f"- {marks[step]} **{step.replace('_', ' ')}**: {text}" for step, text in STEPS.items())
+        ticks = [f"☑ {step.replace('_', ' ')}" for step in STEPS if step in self.tested]
+        return f"Tested in this run: {', '.join(ticks)}."
 
-    def __repr__(self) -> str:
-        return self._repr_markdown_().replace("**", "")
+    __repr__ = _repr_markdown_
 
 
 def checklist(**tests: bool) -> Checklist:
-    """Return the checklist with a tick at each step given as True.
+    """Return the steps given as True, each of which its test has to hold.
 
     Raises:
         ValueError: unknown step.

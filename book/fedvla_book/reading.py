@@ -1,0 +1,102 @@
+"""What of a chapter a reader sees on its page, and how long reading it takes.
+
+Code behind a click (tag ``hide-input``) is not read; what it prints is. Exercises, quiz and folded solutions are extra.
+"""
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+WORDS_A_MINUTE = 200
+SECONDS_A_LINE = 3
+HIDDEN = {"hide-input", "hide-cell", "remove-input", "remove-cell"}
+SENTENCES = {"say", "print", "display", "Markdown", "HTML"}  # calls that print what their strings say
+PICTURES = {"plots", "plt", "ax", "axes", "figure"}  # names whose methods draw
+NO_SUBJECT = ("# Exercises", "# Quiz", "# Checklist")
+
+
+@dataclass(frozen=True)
+class Code:
+    """One code cell: its lines that are about the subject, those that are not, and whether the page shows them."""
+
+    id: str
+    tags: frozenset[str]
+    subject: int
+    plumbing: int
+    words: int
+
+    @property
+    def visible(self) -> bool:
+        """Whether the page shows the code without a click."""
+        return not self.tags & HIDDEN
+
+
+def minutes(chapter: Path) -> int:
+    """Return how many minutes a chapter takes to read: 200 words a minute, and 3 s for each visible line of code."""
+    cells = code_cells(chapter)
+    words = sum(len(text.split()) for text in prose(chapter)) + sum(cell.words for cell in cells)
+    lines = sum(cell.subject + cell.plumbing for cell in cells if cell.visible)
+    return round(words / WORDS_A_MINUTE + lines * SECONDS_A_LINE / 60)
+
+
+def prose(chapter: Path) -> Iterator[str]:
+    """Yield the text cells of a chapter up to its exercises, without what is folded."""
+    for cell in _read_cells(chapter):
+        if cell["cell_type"] == "markdown":
+            text = "".join(cell["source"])
+            if re.search(r"^## Exercises", text, flags=re.MULTILINE):
+                return
+            yield re.sub(r"<details>.*?</details>", "", text, flags=re.DOTALL)
+        yield cell["metadata"].get("mystnb", {}).get("figure", {}).get("caption", "")
+
+
+def code_cells(chapter: Path) -> list[Code]:
+    """Return the code cells of a chapter without its exercises."""
+    found = [_read_code(cell) for cell in _read_cells(chapter) if cell["cell_type"] == "code"]
+    return [cell for cell in found if "exercise" not in cell.tags]
+
+
+def _read_cells(chapter: Path) -> list[dict[str, Any]]:
+    return json.loads(chapter.read_text(encoding="utf-8"))["cells"]
+
+
+def _read_code(cell: dict[str, Any]) -> Code:
+    source = "".join(cell["source"])
+    shown = _without_docstrings(source)
+    dull = {n for part in ast.parse(source).body if _is_plumbing(part) for n in range(part.lineno, part.end_lineno + 1)}
+    words = sum(len(text.split()) for part in ast.walk(ast.parse(source)) for text in _said(part))
+    tags = frozenset(cell["metadata"].get("tags", []))
+    return Code(cell["id"], tags, len(shown - dull), len(shown & dull), words)
+
+
+def _without_docstrings(source: str) -> set[int]:
+    """Return the numbers of the lines that are neither empty, nor a comment, nor part of a docstring."""
+    tree = ast.parse(source)
+    bodies = [part.body for part in ast.walk(tree) if isinstance(part, ast.FunctionDef | ast.ClassDef)]
+    docs = [body[0] for body in bodies if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)]
+    told = {n for doc in docs for n in range(doc.lineno, doc.end_lineno + 1) if doc.value.value is not ...}
+    lines = enumerate(source.splitlines(), start=1)
+    return {n for n, line in lines if line.strip() and not line.lstrip().startswith("#")} - told
+
+
+def _is_plumbing(part: ast.stmt) -> bool:
+    """Whether a statement imports, prints or draws, and so says nothing of the subject."""
+    if isinstance(part, ast.Import | ast.ImportFrom):
+        return True
+    if isinstance(part, ast.For):
+        return all(map(_is_plumbing, part.body))
+    value = getattr(part, "value", None)
+    if isinstance(value, ast.Call):
+        name = ast.unparse(value.func).split(".")[0].split("[")[0]
+        return name in PICTURES or (name in SENTENCES and isinstance(part, ast.Expr))
+    return False
+
+
+def _said(part: ast.AST) -> Iterator[str]:
+    """Yield the strings of a call that prints them."""
+    if isinstance(part, ast.Call) and ast.unparse(part.func) in SENTENCES:
+        yield from (one.value for one in ast.walk(part) if isinstance(one, ast.Constant) and isinstance(one.value, str))
