@@ -1,0 +1,94 @@
+"""The page on adding a strategy: its code runs, in a copy of the library, as a reader would follow it."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fedvla_lib import run_folder
+from fedvla_lib.config import from_profile
+from fedvla_lib.engines import inline
+from fedvla_lib.federation import client_app
+from fedvla_lib.federation.nodes import TooFewReplies
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "book" / "own_strategy.md").read_text()
+
+
+def blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+
+
+def follow(root):
+    """Do what the page says to the library under `root`: the new file, then the lines of its diff."""
+    (root / "fedvla_lib" / "federation" / "strategies" / "clipped_mean.py").write_text(blocks("python")[0])
+    (diff,) = blocks("diff")
+    for name, changes in re.findall(r"^\+\+\+ b/(\S+)\n(.*?)(?=^---|\Z)", diff, flags=re.DOTALL | re.MULTILINE):
+        text = (root / name).read_text()
+        for change in changes.split("@@\n")[1:]:
+            old, new = (
+                "".join(line[1:] for line in change.splitlines(keepends=True) if line[0] == sign) for sign in "-+"
+            )
+            assert text.count(old) == 1, f"{name} has no line {old!r}"
+            text = text.replace(old, new)
+        (root / name).write_text(text)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    root = tmp_path_factory.mktemp("library")
+    shutil.copytree(ROOT / "fedvla_lib", root / "fedvla_lib", ignore=shutil.ignore_patterns("__pycache__"))
+    follow(root)
+    return root
+
+
+def python(library, *arguments):
+    environment = {**os.environ, "PYTHONPATH": str(library)}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=library, env=environment, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.integration
+def test_the_oracle_test_of_the_page_holds_and_fails_without_the_feature(library):
+    strategy, oracle = blocks("python")[:2]
+    python(library, "-c", strategy + oracle)
+    lazy = strategy.replace("np.minimum(1.0, limit / np.maximum(norms, 1e-12))", "np.ones(len(norms))")
+    assert lazy != strategy
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        python(library, "-c", lazy + oracle)
+    assert "AssertionError" in failed.value.stderr
+
+
+@pytest.mark.integration
+def test_the_run_and_the_experiment_of_the_page_give_a_row_each(library, tmp_path):
+    start = "import sys; from fedvla_lib.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    python(
+        library, "-c", start, "run", "--profile", "tiny", "--strategy", "clipped-mean", "--out", str(tmp_path / "runs")
+    )
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run_folder.read_stamp(run)["status"] == "completed"
+    (tmp_path / "clipped.toml").write_text(blocks("toml")[0])
+    plan, out = str(tmp_path / "clipped.toml"), str(tmp_path / "clipped")
+    told = python(library, "-c", start, "experiment", plan, "--out", out, "--jobs", "1")
+    assert {"fedavg", "clipped-mean"} <= set(told.split())
+
+
+@pytest.mark.integration
+def test_a_mod_that_changes_arrays_needs_a_seal(tmp_path):
+    space = {}
+    for block in blocks("python")[1:]:
+        exec(compile(block.split("start = np.array")[0], "own_strategy.md", "exec"), space)
+    config = from_profile(
+        "tiny", base="nano", out=str(tmp_path), num_server_rounds=1, local_steps=1, eval_rollouts=0, client_rollouts=0
+    )
+    for app in (space["watched"], space["rounding"]):
+        run = inline.run_inline(config, clients_app=app, progress=False)
+        assert run_folder.read_metrics(run, "rejected").empty
+    with pytest.raises(TooFewReplies):
+        inline.run_inline(config, clients_app=client_app.build(mods=[space["coarse"]]), progress=False)
+    refused = run_folder.read_metrics(sorted(tmp_path.iterdir())[-1], "rejected")
+    assert set(refused.reason) == {"hash"}
