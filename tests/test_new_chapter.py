@@ -1,5 +1,6 @@
 """A chapter made from the template: its files, its entries in the contents, and the tests that every chapter passes."""
 
+import inspect
 import os
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import new_chapter
 import test_exercises
 import test_notebooks
+import test_reading
 from execution import toc_pages
 
 ROOT = Path(__file__).parents[1]
@@ -54,6 +56,9 @@ def test_it_passes_the_tests_of_every_chapter(copy):
     ]
     for check in checks:
         check(notebook)
+    for name, test in vars(test_reading).items():
+        if name.startswith("test_") and "path" in inspect.signature(test).parameters:
+            test(notebook)
     exercises = list(test_exercises.met(notebook))
     assert len(exercises) >= test_exercises.AT_LEAST
     text = " ".join(before for _, _, before, _, _ in exercises)

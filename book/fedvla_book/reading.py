@@ -16,7 +16,6 @@ SECONDS_A_LINE = 3
 HIDDEN = {"hide-input", "hide-cell", "remove-input", "remove-cell"}
 SENTENCES = {"say", "print", "display", "Markdown", "HTML"}  # calls that print what their strings say
 PICTURES = {"plots", "plt", "ax", "axes", "figure"}  # names whose methods draw
-NO_SUBJECT = ("# Exercises", "# Quiz", "# Checklist")
 
 
 @dataclass(frozen=True)
@@ -66,21 +65,26 @@ def _read_cells(chapter: Path) -> list[dict[str, Any]]:
 
 def _read_code(cell: dict[str, Any]) -> Code:
     source = "".join(cell["source"])
-    shown = _without_docstrings(source)
-    dull = {n for part in ast.parse(source).body if _is_plumbing(part) for n in range(part.lineno, part.end_lineno + 1)}
-    words = sum(len(text.split()) for part in ast.walk(ast.parse(source)) for text in _said(part))
-    tags = frozenset(cell["metadata"].get("tags", []))
-    return Code(cell["id"], tags, len(shown - dull), len(shown & dull), words)
-
-
-def _without_docstrings(source: str) -> set[int]:
-    """Return the numbers of the lines that are neither empty, nor a comment, nor part of a docstring."""
     tree = ast.parse(source)
-    bodies = [part.body for part in ast.walk(tree) if isinstance(part, ast.FunctionDef | ast.ClassDef)]
-    docs = [body[0] for body in bodies if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)]
-    told = {n for doc in docs for n in range(doc.lineno, doc.end_lineno + 1) if doc.value.value is not ...}
+    shown = _lines(source) - _docstrings(tree)
+    dull = {n for part in tree.body if _is_plumbing(part) for n in _lines_of(part)}
+    tags = frozenset(cell["metadata"].get("tags", []))
+    return Code(cell["id"], tags, len(shown - dull), len(shown & dull), sum(len(text.split()) for text in _said(tree)))
+
+
+def _lines(source: str) -> set[int]:
+    """Return the numbers of the lines that are neither empty nor a comment."""
     lines = enumerate(source.splitlines(), start=1)
-    return {n for n, line in lines if line.strip() and not line.lstrip().startswith("#")} - told
+    return {n for n, line in lines if line.strip() and not line.lstrip().startswith("#")}
+
+
+def _lines_of(part: ast.stmt) -> range:
+    return range(part.lineno, part.end_lineno + 1)
+
+
+def _docstrings(tree: ast.AST) -> set[int]:
+    defined = [part for part in ast.walk(tree) if isinstance(part, ast.FunctionDef | ast.ClassDef)]
+    return {n for part in defined if ast.get_docstring(part) is not None for n in _lines_of(part.body[0])}
 
 
 def _is_plumbing(part: ast.stmt) -> bool:
@@ -96,7 +100,8 @@ def _is_plumbing(part: ast.stmt) -> bool:
     return False
 
 
-def _said(part: ast.AST) -> Iterator[str]:
-    """Yield the strings of a call that prints them."""
-    if isinstance(part, ast.Call) and ast.unparse(part.func) in SENTENCES:
-        yield from (one.value for one in ast.walk(part) if isinstance(one, ast.Constant) and isinstance(one.value, str))
+def _said(tree: ast.AST) -> Iterator[str]:
+    """Yield the strings of calls that print them, each once although `display(Markdown(...))` are two."""
+    calls = [part for part in ast.walk(tree) if isinstance(part, ast.Call) and ast.unparse(part.func) in SENTENCES]
+    constants = {one for call in calls for one in ast.walk(call) if isinstance(one, ast.Constant)}
+    yield from (one.value for one in constants if isinstance(one.value, str))

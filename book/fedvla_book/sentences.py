@@ -11,7 +11,7 @@ def say(*sentences: str) -> None:
 
 
 def rate(row: Any) -> str:
-    """Return ``53 % [41, 65] of 60 rollouts`` of a row with `success_rate`, `low`, `high` and `rollouts`."""
+    """Return ``53% [41, 65] of 60 rollouts`` of a row with `success_rate`, `low`, `high` and `rollouts`."""
     return f"{row.success_rate:.0%} {interval(row.low, row.high)} of {row.rollouts:,.0f} rollouts"
 
 
