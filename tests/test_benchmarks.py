@@ -55,17 +55,6 @@ def test_the_base_is_trained_and_acts(run):
     assert row["demonstrations"] == 2 and row["rollouts"] == 1 and row["training [s]"] > 0
 
 
-def test_every_client_is_compared_with_the_federation(tmp_path, run):
-    arguments = ["--seeds", "0", "--rollouts", "1", "--threads", "1"]  # another worker of the tests has the other core
-    found = {row["method"]: row for row in run("four_methods", *arguments)}
-    tasks, clients = 3, from_profile("tiny").num_clients
-    assert found["federated"]["rollouts"] == tasks and found["all clients alone"]["rollouts"] == tasks * clients
-    (kept,) = (tmp_path / "four_methods").glob("*.json")
-    before = kept.stat().st_mtime_ns
-    assert {row["method"]: row for row in run("four_methods", *arguments)} == found
-    assert kept.stat().st_mtime_ns == before  # not measured again
-
-
 def test_bad_input_is_one_line_that_names_it(tmp_path, warm_python):
     command = [warm_python, FOLDER / "fine_tuning.py", "--tasks", "juggle", "--out", tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)

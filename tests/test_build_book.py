@@ -15,7 +15,7 @@ import front_page
 import pages
 from execution import BookError, Chapter
 from fedvla_book import tables
-from fedvla_book.tables import results
+from fedvla_book.sentences import points
 
 ROOT = Path(__file__).parent.parent
 CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"
@@ -341,74 +341,52 @@ def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
     assert pages.VIDEO in (ROOT / pages.FRONT_PAGE).read_bytes()
 
 
+@pytest.fixture(scope="module")
+def ten_labs():
+    """The stored runs of the front page."""
+    return front_page.compared(ROOT / front_page.COMPARISON)
+
+
 @pytest.mark.unit
-def test_the_front_page_says_what_the_stored_comparison_found():
-    stored = results.read_results(ROOT / front_page.COMPARISON)
-    rows = stored[(stored.partition == "task") & (stored.method == "fedavg-200x2x2")]
-    said = front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))
-    assert f"the success rate of the federated model is {100 * rows.success.mean():.1f} % [" in said
-    assert f"over {len(rows):,} rollouts and {rows.run.nunique()} training seeds" in said
-    in_all, in_a_row = (rows[f"steps_{how}"].unique().item() for how in ("in_all", "in_a_row"))
-    assert f"After {in_all} gradient steps in total (by their settings" in said, "nobody counted them"
-    seldom = stored[(stored.partition == "task") & (stored.method == "fedavg-10x4x20")]
-    rates = f"the same total gives {100 * seldom.success.mean():.1f} % ["
-    assert rates in said.split("200 rounds of 2 labs with 2 steps each. With 10 rounds of 4 labs with 20 steps each")[1]
-    assert f"took {in_a_row} and {seldom.steps_in_a_row.unique().item()} steps in a row" in said
-    assert set(stored.partition) <= set(front_page.DEALT)
-    gaps = tables.differences(tables.repeat_partition_free(stored), [("fedavg-200x2x2", "centralized")], seed=0)
-    for gap in gaps.itertuples():  # every partition that has both
-        words = f"{front_page.DEALT[gap.partition]}, {100 * gap.difference:.1f} points [{100 * gap.low:.1f}, "
-        assert words in said.split("The first minus centralized, ")[1].split("\n")[0]
-    assert said.count(" points [") == len(gaps) + 1  # and federated minus labs alone, at their own tasks
+def test_the_front_page_says_what_the_main_comparison_found_whoever_is_ahead(ten_labs):
+    home = ten_labs[ten_labs.place == "own"]
+    alone, federated = (home[home.method == name] for name in ("local-only-400", "federated"))
+    said = front_page.headline(ten_labs)
+    for count in (4, 8):
+        rates = [part[part.demonstrations == count].success.mean() for part in (alone, federated)]
+        part = said.split(f"with {count} demonstrations a lab, in {rates[0]:.0%} [")[1].split(";")[0]
+        assert f"in {rates[1]:.0%} [" in part and f"{100 * (rates[1] - rates[0]):+.1f} points [" in part
+    swapped = {"local-only-400": "federated", "federated": "local-only-400"}
+    reverse = ten_labs.assign(method=ten_labs.method.replace(swapped), samples=1, steps_in_a_row=1)
+    gap = tables.differences(home[home.demonstrations == 8], [("federated", "local-only-400")], seed=0).iloc[0]
+    if gap.low > 0:
+        assert "**behind**" in front_page.headline(reverse)
     assert pages.HEADLINE in (ROOT / pages.FRONT_PAGE).read_bytes()
 
 
 @pytest.mark.unit
-def test_the_front_page_says_what_labs_alone_were_given_and_where_they_were_evaluated():
-    stored = results.read_results(ROOT / front_page.COMPARISON)
-    stored = stored[stored.partition == "task"]
-    said = front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))
-    share, longer = (stored[stored.method == method] for method in ("local-only", "local-only-800"))
-    steps = {method: part.steps_in_all.unique().item() for method, part in (("share", share), ("longer", longer))}
-    at_own = tables.at_own_task(share)
-    own, others = (f"{100 * part.success.mean():.1f} % [" for part in (share[at_own], share[~at_own]))
-    assert f"alone with their share of the steps, {steps['share']} each, reach {own}" in said
-    assert f"over {at_own.sum()} rollouts at their own task and {others}" in said
-    assert "not what a lab can do alone" in said and "Whether federating is worth it, this does not answer" in said
-    own = longer[tables.at_own_task(longer)]
-    federated = stored[(stored.method == "fedavg-200x2x2") & stored.run.isin(own.run)]
-    same = federated.merge(own[["run", "task", "seed"]], on=["run", "task", "seed"])
-    assert len(same) == len(own) and own.counted.all()
-    together = f"{steps['longer']} steps each, {steps['longer'] * share.client.nunique():,} together"
-    assert f"{together} and all at their own task, reach {100 * own.success.mean():.1f} % [" in said
-    assert f"over the same {len(own)} rollouts" in said
-    gap = 100 * (same.success.mean() - own.success.mean())
-    assert f"{100 * same.success.mean():.1f} % [" in said and f"federated minus alone, {gap:.1f} points [" in said
-    assert "one training seed" in said, "of several seeds the sentence says how many"
-    assert front_page.DEALT["lab"] in said.split("not measured here: ")[1], "planned, with no federated model"
+def test_the_front_page_says_where_federation_stays_behind_pooled_training(ten_labs):
+    gaps = tables.differences(ten_labs[ten_labs.place == "own"], [("federated", "centralized")], seed=0)
+    said = front_page.headline(ten_labs)
+    assert f"It is behind with {(gaps.high < 0).sum()} of {len(gaps)} numbers of demonstrations" in said
+    for gap in gaps.itertuples():
+        assert f"{points(gap)}" in said
 
 
 @pytest.mark.unit
-def test_the_front_page_draws_each_method_with_its_steps_and_labs_alone_by_whose_task_it_was(monkeypatch):
-    drawn = []
-    compared = front_page.compared(ROOT / front_page.COMPARISON)
-    draw = front_page.plots.success_intervals
+def test_the_front_page_draws_a_line_for_each_method(ten_labs, monkeypatch):
+    drawn, draw = [], front_page.plots.success_by_demonstrations
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731
-    monkeypatch.setattr(front_page.plots, "success_intervals", keep)
-    image = front_page.outcome(compared)
-    assert image.startswith(b"\x89PNG") and image == front_page.outcome(compared)
-    rows = [label.get_text() for label in drawn[0].get_yticklabels()]
-    assert {"local-only, own task, 80 steps", "local-only, other tasks, 80 steps", "centralized, 800 steps",
-            "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(rows)  # fmt: skip
-    assert front_page.OUTCOME.removeprefix("book/") in front_page.headline(compared)
+    monkeypatch.setattr(front_page.plots, "success_by_demonstrations", keep)
+    image = front_page.outcome(ten_labs)
+    assert image.startswith(b"\x89PNG") and image == front_page.outcome(ten_labs)
+    names = {text.get_text() for text in drawn[0].get_legend().get_texts()}
+    assert names == set(front_page.METHODS)
+    assert front_page.OUTCOME.removeprefix("book/") in front_page.headline(ten_labs)
 
 
 @pytest.mark.unit
-def test_the_front_page_is_not_built_over_methods_that_took_other_steps(monkeypatch):
-    read = results.read_results
-    longer = lambda folder: (rows := read(folder)).assign(  # noqa: E731
-        steps_in_all=rows.steps_in_all.where(rows.method != "centralized", rows.steps_in_all + 1)
-    )
-    monkeypatch.setattr(front_page.results, "read_results", longer)
-    with pytest.raises(BookError, match="fedavg-200x2x2 and centralized differ in total steps"):
-        front_page.headline(front_page.compared(ROOT / front_page.COMPARISON))
+def test_the_front_page_is_not_built_over_methods_that_saw_other_numbers_of_samples(ten_labs):
+    other = ten_labs.assign(samples=ten_labs.samples.where(ten_labs.method != "centralized", ten_labs.samples + 1))
+    with pytest.raises(BookError, match="federated and centralized differ in samples"):
+        front_page.headline(other)

@@ -72,33 +72,6 @@ def rollouts(*cells):
     ])  # fmt: skip
 
 
-def test_methods_that_see_no_partition_are_lent_to_those_of_the_same_recording():
-    table = rollouts(
-        ("task", "start", "base", "one"), ("task", "pooled", "centralized", "one"),
-        ("task", "shared", "federated", "one"), ("iid", "shared", "federated", "one"),
-        ("uneven", "shared", "federated", "one"), ("uneven", "start", "base", "one"),
-        ("lab", "pooled", "centralized", "five"), ("lab", "shared", "federated", "five"),
-    )  # fmt: skip
-    found = tables.repeat_partition_free(table)
-    pd.testing.assert_frame_equal(found[: len(table)], table)
-    lent = found[len(table) :]
-    assert set(zip(lent.partition, lent.method, strict=True)) == {
-        ("iid", "start"), ("iid", "pooled"), ("uneven", "pooled"),
-    }  # fmt: skip
-    assert not lent.success.any() and len(lent) == 3 * 4  # those of partition task, not of another recording
-    assert not found.duplicated(["partition", "method", "run", "seed"]).any()
-
-
-def test_nothing_of_the_stored_comparison_is_lent_between_a_laboratory_and_several():
-    stored = results.read_results(ROOT / "book" / "reference" / "comparison")
-    several = stored.partition == "lab"
-    assert several.any() and not set(stored[several].recording) & set(stored[~several].recording)
-    assert stored[~several].recording.nunique() == 1
-    lab = stored[several & (stored.kind != "base")]
-    found = tables.repeat_partition_free(pd.concat([stored[~several], lab]))
-    assert not ((found.partition == "lab") & (found.kind == "base")).any()
-
-
 def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
     here = rollouts(*((part, "shared", "federated", "one") for part in ("task", "iid", "lab")))
     here = here[(here.partition != "iid") | (here.run == 0)]
@@ -158,20 +131,6 @@ def test_methods_are_named_by_their_steps_and_those_alone_split_by_whose_task_it
     assert {"centralized, 800 steps", "fedavg-200x2x2, 800 steps, 400 in a row"} <= set(names)
     own = rows[(rows.method == "local-only") & tables.at_own_task(rows)]
     assert named[named.method == names[1]].success.mean() == own.success.mean()
-
-
-@pytest.mark.parametrize("seeds", [1, 5])
-def test_labs_alone_are_held_against_the_federation_on_the_very_rollouts_at_their_own_tasks(seeds):
-    rows = results.read_results(COMPARISON)
-    rows = rows[(rows.partition == "task") & (rows.run < seeds)]
-    found = tables.beside_own_tasks(rows, "local-only", "fedavg-200x2x2", seed=0)
-    own = rows[(rows.method == "local-only") & tables.at_own_task(rows)]
-    same = rows[rows.method == "fedavg-200x2x2"].merge(own[["run", "task", "seed"]])
-    assert found["seeds"] == seeds and found["n"] == len(own) == len(same) == 100 * seeds
-    assert found["success_rate"] == own.success.mean() and found["other_rate"] == same.success.mean()
-    assert found["difference"] == pytest.approx(own.success.mean() - same.success.mean())
-    assert found["low"] < found["difference"] < found["high"]
-    assert found["other_low"] < found["other_rate"] < found["other_high"]
 
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):

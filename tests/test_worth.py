@@ -62,6 +62,14 @@ def test_beyond_what_was_measured_the_interval_is_open():
     assert np.isfinite(found.low[2])
 
 
+def test_a_training_seed_that_one_method_lacks_is_left_out():
+    rows = simulated(np.random.default_rng(2), CENTRES)
+    lacking = rows[(rows.run != 4) | (rows.method != "federated") | (rows.demonstrations != 4)]
+    pd.testing.assert_frame_equal(
+        worth(lacking, "federated", "alone", seed=0), worth(rows[rows.run != 4], "federated", "alone", seed=0)
+    )
+
+
 @pytest.mark.slow
 def test_the_interval_of_five_training_seeds_covers_the_truth_as_often_as_it_says():
     """In 300 simulated experiments of the size of the book's: about 94 and 96 times of a hundred."""

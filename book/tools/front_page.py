@@ -1,28 +1,28 @@
-"""The generated parts of the front page: a video of this build, and the result of the stored comparison."""
+"""The generated parts of the front page: a video of this build, and what the stored runs of the ten labs found."""
 
 import re
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import nbformat
+import numpy as np
 import pandas as pd
 
 from execution import BookError
 from fedvla_book import plots, tables
-from fedvla_book.tables import intervals, results
+from fedvla_book.sentences import points, rate
+from fedvla_book.tables import results
+from fedvla_book.tables.worth import worth
 from fedvla_lib.evaluation import figures
 
 VIDEO_CHAPTER = "05_evaluation_videos"
-COMPARISON = "book/reference/comparison"
+COMPARISON = "book/reference/ten_labs"
 OUTCOME = "book/_static/outcome.png"  # its figure
-# Methods in the headline.
-FEDERATED, SELDOM, POOLED = "fedavg-200x2x2", "fedavg-10x4x20", "centralized"
-LOCAL, LOCAL_LONGER = "local-only", "local-only-800"
-NEARLY_SOLVED = 0.8  # success rate of local-only labs above which federating can add little
-DEALT = {"iid": "the same mix of tasks in every lab", "dirichlet-0_5": "uneven mixes (Dirichlet, 0.5)",
-         "dirichlet-0_1": "very uneven mixes (Dirichlet, 0.1)", "task": "one task per lab",
-         "lab": "labs that differ in camera, light and calibration"}  # fmt: skip
+LONE, FEDERATED, POOLED = METHODS = ("local-only-400", "federated", "centralized")
+LONGER = "local-only-800"  # shows whether more steps help a lab alone
+MAIN = (4, 8)  # demonstrations a lab in the main comparison, as the plan says
+IN_WORDS = {LONE: "a lab alone", FEDERATED: "the federation", POOLED: "pooled training"}
+BY = ["partition", "method", "demonstrations", "place"]
 
 
 def video(chapter: Path, profile: str) -> str:
@@ -41,141 +41,116 @@ def video(chapter: Path, profile: str) -> str:
 
 
 def compared(folder: Path) -> pd.DataFrame:
-    """Return the rollouts of the stored comparison; those of a method without partition stand in each partition."""
-    return tables.repeat_partition_free(results.read_results(folder))
+    """Return the rollouts of the stored runs that the front page shows, fewest demonstrations first."""
+    rows = results.read_results(folder).sort_values("demonstrations", kind="stable")
+    return rows[rows.method.isin((*METHODS, LONGER))]
 
 
 def headline(rows: pd.DataFrame) -> str:
-    """The result of the stored comparison for the front page: a list of statements, and a figure.
+    """What the stored runs found, for the front page: a list of statements, and a figure.
 
     Raises:
-        BookError: federated and centralized training differ in total steps, which makes the first statement wrong.
+        BookError: federated and centralized training differ in samples or in steps in a row, and the text says equal.
     """
-    of_task = rows[rows.partition == "task"]
-    of_method = results.summary(of_task).set_index("method")
-    labs, tasks = of_task.client.nunique(), of_task.task.nunique()
-    at_own = tables.beside_own_tasks(of_task, LOCAL_LONGER, FEDERATED, seed=0)
+    home, away = (rows[rows.place == place] for place in (results.OWN, "unseen"))
+    labs, tasks = home.lab.nunique(), home.task.nunique()
+    statements = (_main(home), _worth(home), _away(away), _pooled(home), _paid(home, labs), _open(rows, tasks))
     return "\n".join([
-        f"**Result.** Each of {labs} labs holds demonstrations of one of {tasks} tasks. "
-        "Brackets are 95 % intervals, each on its own; {doc}`/notebooks/06_federated_vs_centralized` explains them.\n",
-        *(f"- {said}" for said in (_at_equal_total(of_method), _cadences(of_method), _gaps(rows),
-                                   _local_share(of_task), _local_longer(of_task, at_own, labs), _open(rows, at_own))),
-        "", _outcome_figure(of_method),
+        f"**Is it worth federating?** {labs} labs, one of {tasks} tasks in each; nano model, simulation. "
+        "Brackets are 95 % intervals over training seeds, each with a recording of its own, and over rollouts; "
+        "{doc}`/notebooks/06_federated_vs_centralized` explains them.\n",
+        *(f"- {said}" for said in statements), "", _outcome_figure(),
     ])  # fmt: skip
 
 
-def _at_equal_total(of_method: pd.DataFrame) -> str:
-    federated, pooled = of_method.loc[FEDERATED], of_method.loc[POOLED]
-    if federated.steps_in_all != pooled.steps_in_all or federated.rollouts != pooled.rollouts:
-        raise BookError(f"{FEDERATED} and {POOLED} differ in total steps or rollouts, and the front page says equal")
-    by = "" if federated.counted and pooled.counted else " (by their settings: these runs did not count them)"
+def _main(home: pd.DataFrame) -> str:
+    found = _differences(home, FEDERATED, LONE)
+    rates = results.summary(home, BY).set_index(["demonstrations", "method"])
+    said = [
+        f"with {count} demonstrations a lab, in {rate(rates.loc[(count, LONE)])} alone and in "
+        f"{rate(rates.loc[(count, FEDERATED)])} with the federation's model: {_gap(found.loc[f'demos-{count}'])}"
+        for count in MAIN
+    ]
+    return f"On a lab's own task, in its own place, the arm succeeds {'; '.join(said)}."
+
+
+def _worth(home: pd.DataFrame) -> str:
+    found = worth(home, FEDERATED, LONE, seed=0).set_index("demonstrations")
+    most = f"more than {home.demonstrations.max():.0f}"
+    said = []
+    for count in MAIN:
+        needed, low, high = (
+            f"{n:.0f}" if np.isfinite(n) else most for n in found.loc[count, ["needed", "low", "high"]]
+        )
+        said.append(f"with {count}, as well as a lab alone with {needed} [{low}, {high}]")
+    return f"What a federation is worth in demonstrations: a lab succeeds, {'; '.join(said)}."
+
+
+def _away(away: pd.DataFrame) -> str:
+    found = _differences(away, FEDERATED, LONE)
+    said = [f"with {count}, {_gap(found.loc[f'demos-{count}'])}" for count in MAIN]
+    return f"In a further lab, where nobody recorded, the federation is, against a lab alone: {'; '.join(said)}."
+
+
+def _pooled(home: pd.DataFrame) -> str:
+    """How far federated training stays behind pooled training, with every number of demonstrations."""
+    found = _differences(home, FEDERATED, POOLED)
+    behind = found[found.high < 0]
+    said = [f"{row.demonstrations:.0f}: {points(row)}" for row in found.itertuples()]
+    verdict = f"It is behind with {len(behind)} of {len(found)} numbers of demonstrations."
+    return f"The federation minus pooled training, by demonstrations a lab: {'; '.join(said)}. {verdict}"
+
+
+def _paid(home: pd.DataFrame, labs: int) -> str:
+    spent = results.summary(home[home.demonstrations == MAIN[-1]], BY).set_index("method")
+    federated, pooled, lone = (spent.loc[name] for name in (FEDERATED, POOLED, LONE))
+    longer = _differences(home, LONGER, LONE).loc[f"demos-{MAIN[-1]}"]
+    for what in ("samples", "steps_in_a_row"):
+        if federated[what] != pooled[what]:
+            raise BookError(f"{FEDERATED} and {POOLED} differ in {what}, and the front page says that they are equal")
     return (
-        f"After {federated.steps_in_all:,.0f} gradient steps in total{by}, the success rate of the federated model is "
-        f"{_rate_of(federated)} and that of centralized training on all demonstrations {_rate_of(pooled)}, "
-        f"each over {federated.rollouts:,} rollouts and {federated.seeds} training seeds."
+        f"Counted while training: {federated.steps_in_a_row:,.0f} gradient steps in a row and {federated.samples:,.0f} "
+        f"samples for the federation and for pooled training alike, and {federated.MB:,.0f} MB sent for the first, "
+        f"{federated.MB / labs:,.1f} a lab. A lab alone took {lone.steps_in_a_row:,.0f} steps; "
+        f"{spent.steps_in_a_row[LONGER]:,.0f} steps instead: {_gap(longer)}."
     )
 
 
-def _cadences(of_method: pd.DataFrame) -> str:
-    federated, seldom, pooled = (of_method.loc[name] for name in (FEDERATED, SELDOM, POOLED))
+def _open(rows: pd.DataFrame, tasks: int) -> str:
+    seeds = rows[rows.method.isin(METHODS)].groupby(["method", "demonstrations"]).run.nunique()
     return (
-        f"That federation averages often: {_cadence(FEDERATED)}. With {_cadence(SELDOM)}, as in chapters 4 to 6, "
-        f"the same total gives {_rate_of(seldom)}. The labs of a round train in parallel, so the two federated models "
-        f"took {federated.steps_in_a_row:,.0f} and {seldom.steps_in_a_row:,.0f} steps in a row, "
-        f"the centralized one {pooled.steps_in_a_row:,.0f}."
+        f"**What this does not show**: other models, real arms, more than {tasks} tasks, labs that differ more than we "
+        f"chose. At least {seeds.min()} training seeds for each point, {len(rows):,} rollouts."
     )
 
 
-def _cadence(method: str) -> str:
-    rounds, labs, steps = method.rsplit("-", 1)[1].split("x")
-    return f"{rounds} rounds of {labs} labs with {steps} steps each"
+def _differences(rows: pd.DataFrame, method: str, other: str) -> pd.DataFrame:
+    found = tables.differences(rows, [(method, other)], seed=0).set_index("partition")
+    return found.assign(demonstrations=rows.groupby("partition").demonstrations.first())
 
 
-def _gaps(rows: pd.DataFrame) -> str:
-    found = tables.differences(rows, [(FEDERATED, POOLED)], seed=0).set_index("partition")
-    gaps = [_gap(words, found.loc[name]) for name, words in DEALT.items() if name in found.index]
-    return (
-        f"The first minus centralized, over the same rollouts: {'; '.join(gaps)}. "
-        "All of them share the same centralized models."
-    )
-
-
-def _local_share(of_task: pd.DataFrame) -> str:
-    """Labs alone with their share of the steps, apart for their own task and for those they have never seen."""
-    share, federated = (of_task[of_task.method == name] for name in (LOCAL, FEDERATED))
-    own = tables.at_own_task(share)
-    times = federated.steps_in_all.mean() / share.steps_in_all.mean()
-    return (
-        f"Labs alone with their share of the steps, {share.steps_in_all.mean():,.0f} each, reach {_rate(share[own])} "
-        f"at their own task and {_rate(share[~own])} at the others'. "
-        f"The federated model took {times:.0f} times as many steps, so this is not what a lab can do alone."
-    )
-
-
-def _local_longer(of_task: pd.DataFrame, found: dict[str, Any], labs: int) -> str:
-    """Labs alone with as many steps as the federation, at their own task, next to the federated model."""
-    longer = of_task[of_task.method == LOCAL_LONGER]
-    steps, elsewhere = longer.steps_in_all.mean(), longer[~tables.at_own_task(longer)]
-    rates = [_percent(*(found[f"{who}_{end}"] for end in ("rate", "low", "high"))) for who in ("success", "other")]
-    gap = _points(*(-100 * found[end] for end in ("difference", "high", "low")), " points")
-    seeds = "one training seed" if found["seeds"] == 1 else f"{found['seeds']} training seeds"
-    once = " These intervals do not cover other training seeds." if found["seeds"] == 1 else ""
-    return (
-        f"Labs alone with {steps:,.0f} steps each, {labs * steps:,.0f} together and all at their own task, reach "
-        f"{rates[0]} there, and the federated model {rates[1]} over the same {found['n']:,} rollouts of {seeds}: "
-        f"federated minus alone, {gap}.{once} At the others' tasks they reach {_rate(elsewhere)}; "
-        "the federated model is one model for all tasks."
-    )
-
-
-def _open(rows: pd.DataFrame, found: dict[str, Any]) -> str:
-    """What this grid leaves open, and why."""
-    missing = [words for name, words in DEALT.items()
-               if not (rows[rows.partition == name].method == FEDERATED).any()]  # fmt: skip
-    solved = found["success_rate"] > NEARLY_SOLVED
-    easy = "a lab's own demonstrations nearly solve its task" if solved else "a lab has few demonstrations of one task"
-    measured = f" Planned, and not measured here: federated with {'; '.join(missing)}." if missing else ""
-    return f"**Whether federating is worth it, this does not answer**: {easy}.{measured}"
-
-
-def _outcome_figure(of_method: pd.DataFrame) -> str:
-    few = [f"`{method}`" for method, seeds in of_method.seeds.items() if seeds == 1]
-    once = f" With one training seed, hence intervals over rollouts only: {', '.join(few)}." if few else ""
+def _outcome_figure() -> str:
+    names = "; ".join(f"`{method}`: {words}" for method, words in IN_WORDS.items())
     return (
         f"```{{figure}} {Path(OUTCOME).relative_to('book').as_posix()}\n"
-        ":alt: Points with intervals, a row per method with the gradient steps of its model: success rates of the "
-        "base, of labs alone at their own task and at other tasks, of two federations and of centralized training.\n"
+        ":alt: Success rate against demonstrations per lab, with intervals: a line each for labs alone, for the "
+        "federation and for pooled training.\n"
         ":width: 100%\n\n"
-        "Success rate of each method with one task per lab, and the gradient steps of one model. For labs alone, "
-        f"rollouts at their own task and at other tasks are shown separately.{once}\n```"
+        f"Success at a lab's own task, in its own place. {names}.\n```"
     )
 
 
 def outcome(rows: pd.DataFrame) -> bytes:
     """The figure below the headline, as PNG."""
     plots.use_style()
-    axes = plots.success_intervals(results.summary(tables.by_steps(rows[rows.partition == "task"])), ylabel="method")
+    shown = rows[(rows.place == results.OWN) & rows.method.isin(METHODS)]
+    axes = plots.success_by_demonstrations(results.summary(shown, BY))
     with tempfile.TemporaryDirectory() as folder:
         figures.save(axes, Path(folder) / "outcome.png")
         return (Path(folder) / "outcome.png").read_bytes()
 
 
-def _rate_of(found: pd.Series) -> str:
-    return _percent(found.success_rate, found.low, found.high)
-
-
-def _rate(rows: pd.DataFrame) -> str:
-    return f"{_percent(rows.success.mean(), *intervals.success_interval(rows))} over {len(rows):,} rollouts"
-
-
-def _percent(rate: float, low: float, high: float) -> str:
-    return _points(100 * rate, 100 * low, 100 * high, " %")
-
-
-def _gap(words: str, found: pd.Series) -> str:
-    gap = _points(100 * found.difference, 100 * found.low, 100 * found.high, " points")
-    return f"{words}, {gap}, {found.seeds} seeds, {found.n:,} pairs"
-
-
-def _points(value: float, low: float, high: float, unit: str) -> str:
-    return f"{value:.1f}{unit} [{low:.1f}, {high:.1f}]"
+def _gap(found: pd.Series) -> str:
+    """A difference in words that its interval supports."""
+    ahead = "ahead" if found.difference > 0 else "**behind**"
+    return f"{'not shown to differ' if found.low <= 0 <= found.high else ahead}, {points(found)}"

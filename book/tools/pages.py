@@ -26,7 +26,6 @@ INSTRUCTION = {"right": "this cube's colour", "other": "the other cube's colour"
 # Pages that end with stored results of benchmarks.
 RESULTS_ON = {
     MODEL_CARD: ["fine_tuning"],
-    "book/reference_runs.md": ["four_methods"],
     "book/speed.md": [
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor", "busy",
         "start_up",
@@ -36,7 +35,6 @@ RESULTS_ON = {
 TITLES = {
     "fine_tuning": "fine-tuning: each task alone from the base, on one core",
     "floor": "the floor",
-    "four_methods": "federated, local-only with its share of the steps, and centralized",
 }
 BENCHMARKS = "benchmarks/results"
 

@@ -4,38 +4,16 @@ STEPS = """def steps_spent(rounds, drawn, num_clients, local_steps):
     total = rounds * drawn * local_steps
     return {steps}
 """
-ERRORS = """import numpy as np
-
-
-def two_errors(left, right):
-    n = len(left)
-    pairs, apart = (left - right).std(), np.sqrt(left.var() + right.var())
-    return {errors}
-"""
-EXACT = """from math import comb
-
-
-def exact_p(a, b):
-    n = a + b
-    tail = sum(comb(n, k) for k in range(min(a, b) + 1)) / 2**n
-    return {p}
+BUDGETS = """def three_budgets(rounds, drawn, local_steps, mb):
+    return {budgets}
 """
 NEEDED = """import numpy as np
 
 
-def pairs_needed(points, only_left, only_right, n):
+def demonstrations_needed(counts, rates, wanted):
+    if wanted > rates[-1]:
+        return {beyond}
     return {needed}
-"""
-PARTS = """import numpy as np
-
-
-def error_over_seeds(values):
-    seeds, rollouts = values.shape
-    of_seeds = rollouts * values.mean(axis=1).var(ddof=1)
-    of_rollouts = seeds * values.mean(axis=0).var(ddof=1)
-    left = values - values.mean(axis=1, keepdims=True) - values.mean(axis=0) + values.mean()
-    rest = (left**2).sum() / ((seeds - 1) * (rollouts - 1))
-    return {error}
 """
 
 WRONG = {
@@ -67,42 +45,28 @@ WRONG = {
             "may also have made more",
         ),
     ],
-    "two_errors": [
-        (ERRORS.format(errors="np.array([apart, apart]) / n**0.5"), "ignores the pairs"),
-        (ERRORS.format(errors="apart / n**0.5, pairs / n**0.5"), "swapped"),
-        (ERRORS.format(errors="pairs, apart"), "one rollout"),
-        (ERRORS.format(errors="pairs / n, apart / n"), "over the root of n"),
-        (ERRORS.format(errors="pairs / n**0.5, (left.std() + right.std()) / n**0.5"), "variances"),
-        (ERRORS.format(errors="pairs / n**0.5"), "two numbers"),
+    "three_budgets": [
+        (BUDGETS.format(budgets="rounds * local_steps"), "three numbers"),
+        (BUDGETS.format(budgets="[rounds * drawn * local_steps] * 2 + [2 * rounds * drawn * mb]"), "side by side"),
+        (BUDGETS.format(budgets="drawn * local_steps, local_steps, 2 * drawn * mb"), "follow in a row"),
+        (BUDGETS.format(budgets="rounds * local_steps, rounds * local_steps + 1, 2 * mb"), "adds the local steps"),
+        (BUDGETS.format(budgets="local_steps * drawn, rounds * local_steps, 2 * rounds * drawn * mb"), "every drawn"),
+        (BUDGETS.format(budgets="rounds * drawn * local_steps, rounds * local_steps, rounds * drawn * mb"), "twice"),
+        (BUDGETS.format(budgets="rounds * drawn * local_steps, rounds * local_steps, 2 * rounds * mb"), "Every drawn"),
+        (BUDGETS.format(budgets="rounds * drawn * local_steps, rounds * local_steps, mb"), "count the transfers"),
     ],
-    "exact_p": [
-        (EXACT.format(p="tail"), "one side"),
-        (EXACT.format(p="2 * tail"), "above 1"),
-        (EXACT.format(p="min(1, 2 * tail) if n else 0.0"), "p = 1"),
-        (EXACT.format(p="min(1, 2 * comb(n, a) / 2**n)"), "More uneven splits"),
+    "demonstrations_needed": [
+        (NEEDED.format(beyond="np.inf", needed="np.interp(wanted, rates, counts)"), "in the logarithm"),
+        (NEEDED.format(beyond="np.inf", needed="np.interp(wanted, rates, np.log2(counts))"), "turn it back"),
+        (NEEDED.format(beyond="np.inf", needed="counts[np.searchsorted(rates, wanted)]"), "pass 0.3"),
+        (NEEDED.format(beyond="counts[-1]", needed="2 ** np.interp(wanted, rates, np.log2(counts))"), "not reached"),
+        (NEEDED.format(beyond="32.0", needed="2 ** np.interp(wanted, rates, np.log2(counts))"), "return infinity"),
         (
-            "from scipy.stats import chi2\n\n\ndef exact_p(a, b):\n    return chi2.sf((a - b) ** 2 / (a + b), 1)",
-            "toss a fair coin",
+            NEEDED.format(
+                beyond="np.inf", needed="2 ** np.interp(wanted, rates, np.log2(counts), left=0.0) - 0.0"
+            ).replace("left=0.0", "left=-1.0"),
+            "smallest count",
         ),
-    ],
-    "pairs_needed": [
-        (NEEDED.format(needed="int(np.ceil((2.8 / points) ** 2 * (only_left + only_right) / n))"), "hundredths"),
-        (NEEDED.format(needed="int(np.ceil((280 / points) ** 2 * (only_left + only_right)))"), "not their number"),
-        (NEEDED.format(needed="int(np.ceil((280 / points) ** 2 * (only_left - only_right) / n))"), "Both kinds"),
-        (NEEDED.format(needed="int(np.ceil((280 / points) ** 2))"), "Pairs that agree"),
-        (NEEDED.format(needed="(280 / points) ** 2 * (only_left + only_right) / n"), "round up"),
-        (NEEDED.format(needed="int((280 / points) ** 2 * (only_left + only_right) / n)"), "round up"),
-        (NEEDED.format(needed="int(np.ceil((196 / points) ** 2 * (only_left + only_right) / n))"), "Solve"),
-    ],
-    "error_over_seeds": [
-        (PARTS.format(error="values.std() / values.size**0.5"), "counts every rollout"),
-        (PARTS.format(error="values.mean(axis=1).std(ddof=1) / seeds**0.5"), "same rollouts"),
-        (PARTS.format(error="np.sqrt((of_seeds + of_rollouts) / values.size)"), "subtract it"),
-        (PARTS.format(error="(of_seeds + of_rollouts - rest) / values.size"), "take the root"),
-        (
-            PARTS.format(error="np.sqrt((of_seeds + of_rollouts - (left**2).mean()) / values.size)"),
-            "degrees of freedom",
-        ),
-        (PARTS.format(error="values.std(axis=0)"), "one number"),
+        (NEEDED.format(beyond="np.inf", needed="[wanted]"), "one number"),
     ],
 }

@@ -7,7 +7,6 @@ from fedvla_book.tables.checkpoints import clear_pairs, correlations, disagreeme
 from fedvla_book.tables.clients import heterogeneity
 from fedvla_book.tables.grids import (
     at_own_task,
-    beside_own_tasks,
     by_steps,
     crossed_bootstrap,
     differences,
@@ -15,7 +14,6 @@ from fedvla_book.tables.grids import (
     paired,
     paired_difference,
     read_rounds,
-    repeat_partition_free,
 )
 from fedvla_book.tables.model import adapters, averaging_error, learning_rates, module_table
 
@@ -26,7 +24,6 @@ __all__ = [
     "adapters",
     "at_own_task",
     "averaging_error",
-    "beside_own_tasks",
     "by_steps",
     "clear_pairs",
     "correlations",
@@ -37,5 +34,4 @@ __all__ = [
     "learning_rates",
     "module_table",
     "read_rounds",
-    "repeat_partition_free",
 ]

@@ -14,33 +14,14 @@ from fedvla_lib.evaluation import statistics
 from fedvla_lib.evaluation.statistics import CONFIDENCE, P_VALUES
 
 OF_RUN = ("partition", "method", "run")
-PARTITION_FREE = ("base", "centralized")  # kinds that do not depend on the partition of a recording
 OWN, OTHER = "own task", "other tasks"
-
-
-def repeat_partition_free(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, and repeat partition-independent methods for each partition of the same recording.
-
-    Base and centralized training do not depend on the partition, so they are measured with one partition and repeated
-    for the others, with the same seeds and rollouts. A partition that has its own rows of a method keeps only those.
-
-    Args:
-        rows: of `results.read_results`.
-    """
-    repeated = []
-    for _, part in rows.groupby("recording", sort=False):
-        for _, measured in part[part.kind.isin(PARTITION_FREE)].groupby("method", sort=False):
-            source = measured[measured.partition == measured.partition.iloc[0]]
-            missing = [name for name in part.partition.unique() if name not in set(measured.partition)]
-            repeated += [source.assign(partition=name) for name in missing]
-    return pd.concat([rows, *repeated], ignore_index=True)
 
 
 def fill_in(rows: pd.DataFrame, other: pd.DataFrame, method: str) -> pd.DataFrame:
     """Return the partitions of `rows` in which `method` has at least two training seeds, and the rest from `other`.
 
     Args:
-        rows, other: of `results.read_results` or `repeat_partition_free`; equal names are equal partitions.
+        rows, other: of `results.read_results`; equal names are equal partitions.
     """
     seeds = rows[rows.method == method].groupby("partition").run.nunique()
     kept = rows[rows.partition.isin(seeds.index[seeds > 1])]
@@ -138,33 +119,6 @@ def by_steps(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _in_words(in_all: float, in_a_row: float) -> str:
     return f"{in_all:,.0f} steps" + (f", {in_a_row:,.0f} in a row" if in_a_row < in_all else "")
-
-
-def beside_own_tasks(rows: pd.DataFrame, method: str, other: str, *, seed: int) -> dict[str, Any]:
-    """Compare local-only clients, each at its own task, with another method on the same rollouts.
-
-    Args:
-        rows: of `results.read_results`, of partition `task`.
-        method: a local-only method.
-        other: a method with the same rollouts.
-        seed: of the bootstrap.
-
-    Returns:
-        `paired_difference` of method - other if they share one training seed, else
-        `difference_over_seeds`; also seeds, and the rates of both: success_rate and other_rate, each with
-        _low and _high.
-    """
-    own = rows[(rows.method == method) & at_own_task(rows)]
-    key = ["run", "task", "seed"]
-    same = rows[rows.method == other].merge(own[key], on=key)
-    own = own[own.run.isin(same.run)]
-    both, seeds = pd.concat([own, same], ignore_index=True), int(own.run.nunique())
-    difference = paired_difference if seeds == 1 else difference_over_seeds
-    found = {"seeds": seeds, **difference(both, method, other, seed=seed)}
-    for name, part in (("success", own), ("other", same)):
-        low, high = intervals.success_interval(part)
-        found |= {f"{name}_rate": float(part.success.mean()), f"{name}_low": low, f"{name}_high": high}
-    return found
 
 
 def paired(rows: pd.DataFrame, method: str, other: str) -> pd.DataFrame:

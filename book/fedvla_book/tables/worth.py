@@ -41,8 +41,8 @@ def worth(
     """Return a row for each number of demonstrations that `method` was trained with.
 
     Args:
-        rows: rollouts with columns demonstrations (per lab), method, run, task, seed and success; all methods and
-            counts have the same training seeds and rollouts.
+        rows: rollouts with columns demonstrations (per lab), method, run, task, seed and success. Training seeds that
+            one of the two methods lacks with some number of demonstrations are left out.
         method: the federation's method.
         alone: the method of labs alone.
         seed: of the bootstrap.
@@ -53,7 +53,9 @@ def worth(
     The interval is that of the crossed bootstrap (Owen 2007, see `grids.crossed_bootstrap`), with the same training
     seeds and rollouts drawn for both methods; infinity means more than was measured.
     """
-    outcomes = {key: by_run(part) for key, part in rows.groupby(["method", "demonstrations"])}
+    groups = rows[rows.method.isin((method, alone))].groupby(["method", "demonstrations"])
+    shared = set.intersection(*(set(part.run) for _, part in groups))
+    outcomes = {key: by_run(part[part.run.isin(shared)]) for key, part in groups}
     counts = sorted(count for name, count in outcomes if name == alone)
     names = [(alone, count) for count in counts] + sorted(key for key in outcomes if key[0] == method)
     means = resampled_means([outcomes[name] for name in names], seed=seed, resamples=resamples)
