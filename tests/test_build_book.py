@@ -16,6 +16,7 @@ import pages
 from execution import BookError, Chapter
 from fedvla_book import tables
 from fedvla_book.sentences import points
+from fedvla_book.video_player import AT_ONCE, CONTROLS
 
 ROOT = Path(__file__).parent.parent
 CODE = "import pathlib\nwith open('ran.txt', 'a') as log:\n    log.write(profile + '\\n')\nprint(profile)"
@@ -327,15 +328,15 @@ def test_a_changed_stylesheet_alone_reaches_the_pages_and_the_root_leads_to_the_
     assert "url=book/index.html" in front_door and 'rel="icon" href="data:,"' in front_door
 
 
-def figure(number: int, ending: str) -> str:
-    return f'<figure><video aria-label="Round {number}. Lift the red cube. {ending}"></video></figure>'
+def figure(number: int, ending: str, how: str = CONTROLS) -> str:
+    return f'<figure><video {how} aria-label="Round {number}. Lift the red cube. {ending}"></video></figure>'
 
 
 @pytest.mark.unit
 def test_the_front_page_shows_the_first_video_of_the_last_round(tmp_path):
     html = "".join([figure(0, "no"), figure(10, "failed"), figure(0, "no"), figure(10, "worked")])
     said = front_page.video(showing(f"<div>{html}</div>", tmp_path / "videos.ipynb"), "tiny")
-    assert said.startswith(figure(10, "failed") + "\n\n") and "profile `tiny`" in said
+    assert said.startswith(figure(10, "failed", AT_ONCE) + "\n\n") and "profile `tiny`" in said
     with pytest.raises(BookError, match="videos.ipynb shows no video"):
         front_page.video(showing("", tmp_path / "videos.ipynb"), "tiny")
     assert pages.VIDEO in (ROOT / pages.FRONT_PAGE).read_bytes()

@@ -2,7 +2,6 @@
 
 import io
 from base64 import b64encode
-from collections.abc import Sequence
 from fractions import Fraction
 from html import escape
 from pathlib import Path
@@ -11,7 +10,11 @@ import av
 import numpy as np
 
 MAX_BYTES = 1_000_000  # a page holds several videos, each a third larger in base64
-PLAYER = "muted loop controls playsinline preload='metadata' style='width:100%'"
+STYLE = "muted loop playsinline preload='metadata' style='width:100%'"
+CONTROLS = "controls"
+# Instead of controls over the picture: it plays, and a click or the space bar stops it.
+AT_ONCE = """autoplay tabindex='0' onclick='this.paused ? this.play() : this.pause()' \
+onkeydown='if (event.key === " ") { event.preventDefault(); this.click() }'"""
 CAPTION_STYLE = "color:inherit;font-weight:400"  # for light and dark pages
 
 
@@ -28,18 +31,12 @@ def video_figure(video: Path | str | bytes, sentence: str) -> str:
     poster, seconds = _poster_and_length(content, name)
     text = escape(" ".join(sentence.split()))
     player = (
-        f'<video {PLAYER} aria-label="{text}" poster="{_uri("image/jpeg", poster)}" src="{_uri("video/mp4", content)}">'
+        f'<video {CONTROLS} {STYLE} aria-label="{text}" poster="{_uri("image/jpeg", poster)}" '
+        f'src="{_uri("video/mp4", content)}">'
         f'<track kind="captions" srclang="en" label="English" src="{_uri("text/vtt", _captions(text, seconds))}">'
         "</video>"
     )
     return f"<figure style='margin:0'>{player}<figcaption style='{CAPTION_STYLE}'>{text}</figcaption></figure>"
-
-
-def side_by_side(videos: Sequence[np.ndarray]) -> np.ndarray:
-    """Join videos of one height, uint8 (T, H, W, 3), left to right; shorter ones repeat their last frame."""
-    longest = max(map(len, videos))
-    padded = [np.concatenate([frames, frames[-1:].repeat(longest - len(frames), axis=0)]) for frames in videos]
-    return np.concatenate(padded, axis=2)
 
 
 def _poster_and_length(content: bytes, name: str) -> tuple[bytes, float]:

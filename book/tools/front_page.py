@@ -13,6 +13,7 @@ from fedvla_book import plots, tables
 from fedvla_book.sentences import points, rate
 from fedvla_book.tables import results
 from fedvla_book.tables.worth import worth
+from fedvla_book.video_player import AT_ONCE, CONTROLS
 from fedvla_lib.evaluation import figures
 
 VIDEO_CHAPTER = "05_evaluation_videos"
@@ -33,9 +34,10 @@ def video(chapter: Path, profile: str) -> str:
     by_round = {one: int(label[1]) for one in figures if (label := re.search(r'aria-label="Round (\d+)\.', one))}
     if not by_round:
         raise BookError(f"{chapter.name} shows no video of a round, which the front page needs")
+    figure = max(by_round, key=by_round.get).replace(f"<video {CONTROLS} ", f"<video {AT_ONCE} ")
     return (
-        f"{max(by_round, key=by_round.get)}\n\nThe federated policy that chapter 4 trained in this build, profile "
-        f"`{profile}` (not one of those in the result below): overhead camera left, front camera right. "
+        f"{figure}\n\nThe federated policy that chapter 4 trained in this build, profile `{profile}` (not one of those "
+        "in the result below): overhead camera left, front camera right; a click or the space bar stops it. "
         "{doc}`/notebooks/05_evaluation_videos` shows the others, failures included."
     )
 

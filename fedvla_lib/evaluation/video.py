@@ -2,7 +2,9 @@
 
 import io
 import tempfile
+from collections.abc import Iterable
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 
 import av
@@ -27,24 +29,26 @@ def save_rollout(episode: Episode, folder: Path) -> Path:
     return path
 
 
-def encode_video(frames: np.ndarray) -> bytes:
-    """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first.
+def encode_video(frames: Iterable[np.ndarray], fps: int = FPS, crf: int = 20) -> bytes:
+    """Encode uint8 frames (T, H, W, 3) as an mp4 that browsers play: H.264, yuv420p, index first; `crf` is its loss.
 
     Raises:
         ValueError: wrong shape or dtype, no frames, or odd width or height (yuv420p halves both).
     """
-    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
-        raise ValueError(f"frames are {frames.dtype} {frames.shape}: give uint8 (T, H, W, 3) with T > 0")
-    height, width = frames.shape[1:3]
+    frames = iter(frames)
+    first = next(frames, np.empty(0))
+    if first.ndim != 3 or first.shape[-1] != 3 or first.dtype != np.uint8:
+        raise ValueError(f"the first frame is {first.dtype} {first.shape}: give uint8 (H, W, 3), at least one")
+    height, width = first.shape[:2]
     if height % 2 or width % 2:
         raise ValueError(f"frames are {width} x {height} pixels: give even sides")
     with tempfile.TemporaryDirectory() as scratch:  # moving the index to the front needs a real file
         path = Path(scratch) / "video.mp4"
         with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
-            quality = {"crf": "20", "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
-            stream = container.add_stream("libx264", rate=FPS, options=quality)
+            quality = {"crf": str(crf), "preset": "veryfast", "threads": "1", "x264-params": "log=-1"}
+            stream = container.add_stream("libx264", rate=fps, options=quality)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            for pixels in frames:
+            for pixels in chain([first], frames):
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             container.mux(stream.encode(None))
         return path.read_bytes()

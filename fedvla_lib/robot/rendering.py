@@ -85,6 +85,17 @@ class SceneRenderer(mujoco.Renderer):
         super().close()
 
 
+def pose_between(
+    model: mujoco.MjModel, data: mujoco.MjData, before: np.ndarray, after: np.ndarray, share: float
+) -> None:
+    """Pose a scene a share of the way from one `qpos` to another; orientations turn at a constant rate."""
+    way = np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, way, 1.0, before, after)
+    data.qpos[:] = before
+    mujoco.mj_integratePos(model, data.qpos, way, share)
+    mujoco.mj_forward(model, data)
+
+
 @contextmanager
 def garbage_collection_paused() -> Iterator[None]:
     """Pause garbage collection: collecting another renderer would change the current OpenGL context while rendering."""

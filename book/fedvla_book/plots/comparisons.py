@@ -52,8 +52,7 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     errors = 100 * to_ends(table, "difference")
     ax.errorbar(100 * table.difference, places, xerr=errors, fmt="o", capsize=4, color=PALETTE[0])
     ax.axvline(0, color="#555555", linewidth=1)
-    reach = max(20, 105 * table[["low", "high"]].abs().to_numpy().max())
-    ax.set_xlim(-reach, reach)
+    ax.set_xlim(min(-2, 100 * table.low.min() - 2), max(2, 100 * table.high.max() + 2))  # no difference is in view
     ax.set_yticks(places, table.method + " − " + table.other)
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.set_xlabel("difference in success rate [points], 95 % interval")

@@ -96,7 +96,7 @@ def success_intervals(table: pd.DataFrame, *, ylabel: str = "strategy", ax: Axes
         ax.errorbar(100 * part.success_rate, rows, xerr=errors, fmt="o", capsize=3, color=color, label=partition)
     ax.set_yticks(range(len(methods)), methods)
     ax.set_ylim(len(methods) - 0.5, -0.5)
-    ax.set_xlim(-2, 102)
+    ax.set_xlim(max(-2, 100 * table.low.min() - 4), min(102, 100 * table.high.max() + 4))
     ax.set_xlabel("success rate [%], 95 % interval")
     ax.set_ylabel(ylabel)
     if len(partitions) > 1:
