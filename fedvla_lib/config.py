@@ -22,7 +22,7 @@ class Config:
     num_labs: int = 1  # labs that record demonstrations; each has its cameras, light, colours, calibration, operator
     one_task_per_lab: bool = False  # lab k records only task k, counted modulo the number of tasks
     val_fraction: float = 0.1  # fraction of each task's episodes held out for validation
-    normalisation: str = "pooled"  # joint statistics: pooled, or a deliberate mistake: own, held-out, none
+    normalisation: str = "pooled"  # joint statistics: pooled, or one of three deliberate mistakes: own, held-out, none
     augment: bool = False  # augment training images; if off, the prefix of a frozen model is cached for each frame
     # federation
     num_clients: int = 10  # clients that the episodes are partitioned over
@@ -30,7 +30,7 @@ class Config:
     dirichlet_alpha: float = 0.5  # concentration of the Dirichlet partition; small values give a client few tasks
     num_server_rounds: int = 10  # federated rounds
     fraction_train: float = 0.4  # fraction of clients that train in each round
-    sampling: str = "uniform"  # who trains in a round: uniform, or by-task: tasks take turns, as clients announce them
+    sampling: str = "uniform"  # who trains in a round: uniform, or by-task (the tasks that clients announce take turns)
     fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
     min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out

@@ -191,7 +191,7 @@ def _make_folder(out: Path) -> Path:
 
 
 def read_events(root: Path) -> list[dict[str, Any]]:
-    """Return the complete events of a run; raise ValueError if it is no run folder, or a line is not an event."""
+    """Return the complete events of a run; raise ValueError if it is not a run folder, or a line is not an event."""
     path = Path(root) / METRICS_FILE
     if not path.is_file():
         raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")

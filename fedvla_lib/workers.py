@@ -47,9 +47,9 @@ def side_by_side(
     """Yield (item, result) for each item, as they complete; with one job in this process, one after the other.
 
     Args:
-        function: of one item; with several jobs both are pickled, so `function` stands in a module.
+        function: of one item; with several jobs both are pickled, so `function` is defined in a module.
         items: the earlier ones start first.
-        jobs: processes at most.
+        jobs: the most processes at a time.
         preload: modules that the processes share, imported once.
         here: this process is one of them, and works while the others start; for pieces that take equally long.
 

@@ -358,7 +358,9 @@ def test_the_front_page_says_what_the_main_comparison_found_whoever_is_ahead(ten
         part = said.split(f"with {count} demonstrations a lab, in {rates[0]:.0%} [")[1].split(";")[0]
         assert f"in {rates[1]:.0%} [" in part and f"{100 * (rates[1] - rates[0]):+.1f} points [" in part
     swapped = {"local-only-400": "federated", "federated": "local-only-400"}
-    reverse = ten_labs.assign(method=ten_labs.method.replace(swapped), samples=1, steps_in_a_row=1)
+    kinds = ten_labs.method.map({"local-only-400": "federated", "federated": "local-only"}).fillna(ten_labs.kind)
+    names = ten_labs.method.replace(swapped)
+    reverse = ten_labs.assign(method=names, kind=kinds, samples=1, steps_in_a_row=1)
     gap = tables.differences(home[home.demonstrations == 8], [("federated", "local-only-400")], seed=0).iloc[0]
     if gap.low > 0:
         assert "**behind**" in front_page.headline(reverse)

@@ -95,7 +95,7 @@ def test_the_cost_of_chapters_that_ran_side_by_side_is_not_kept(tmp_path):
     notebook = nbformat.read(tmp_path / "01_a.ipynb", as_version=4)
     notebook.metadata["fedvla"]["at_a_time"] = 2
     nbformat.write(notebook, tmp_path / "01_a.ipynb")
-    with pytest.raises(ValueError, match="01_a.ipynb was executed with 2 at a time"):
+    with pytest.raises(ValueError, match="01_a.ipynb was executed as one of 2 at a time"):
         keep_costs.measured_in(tmp_path / "01_a.ipynb")
 
 

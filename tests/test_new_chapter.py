@@ -87,7 +87,7 @@ def test_it_runs_and_its_solutions_pass_their_checks(copy):
 
 @pytest.mark.unit
 @pytest.mark.parametrize(
-    ("name", "message"), [("privacy", "'privacy' is no chapter name"), ("02_again", "taken by 02_partitioning")]
+    ("name", "message"), [("privacy", "'privacy' is not a chapter name"), ("02_again", "taken by 02_partitioning")]
 )
 def test_an_invalid_name_is_refused(name, message):
     with pytest.raises(ValueError, match=message):

@@ -154,7 +154,7 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tiny, tmp_path, capsys):
     done = inline.run_inline(replace(tiny, num_server_rounds=1), progress=False)
     refusals = {
         (str(done),): "completed run",
-        (str(tmp_path / "nowhere"),): "no run folder there",
+        (str(tmp_path / "nowhere"),): "is not a run folder: it has no config.json",
         (str(done), "--lr", "0.1"): "--lr cannot be given with --resume",
     }
     capsys.readouterr()

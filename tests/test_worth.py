@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy.stats import norm
 
-from fedvla_book.tables.worth import demonstrations_to_match, worth
+from fedvla_book.tables.worth import alone_at_best, demonstrations_to_match, worth
 
 pytestmark = pytest.mark.unit
 
@@ -68,6 +68,20 @@ def test_a_training_seed_that_one_method_lacks_is_left_out():
     pd.testing.assert_frame_equal(
         worth(lacking, "federated", "alone", seed=0), worth(rows[rows.run != 4], "federated", "alone", seed=0)
     )
+
+
+def test_labs_alone_are_taken_at_the_number_of_steps_that_served_them_best_in_their_own_place():
+    rows = pd.DataFrame([
+        {"method": method, "kind": kind, "demonstrations": count, "place": place, "success": success}
+        for method, kind, count, own in (
+            ("alone-400", "local-only", 8, 1), ("alone-800", "local-only", 8, 0), ("alone-400", "local-only", 16, 0),
+            ("alone-800", "local-only", 16, 1), ("federated", "federated", 8, 0),
+        ) for place, success in (("own", own), ("unseen", 1 - own))
+    ])  # fmt: skip
+    found = alone_at_best(rows)
+    alone = found[found.method == "local-only"].set_index(["demonstrations", "place"]).success
+    assert alone.to_dict() == {(8, "own"): 1, (8, "unseen"): 0, (16, "own"): 1, (16, "unseen"): 0}
+    assert (found.method == "federated").sum() == 2 and len(found) == 6
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Shared by chapters: the steps of a federated run that a chapter has tested, and the display of library source.
 
-The nine steps stand, each with what it means, in ``book/how_to_read.md``.
+``book/how_to_read.md`` lists the nine steps with what each means.
 """
 
 import inspect
@@ -30,7 +30,7 @@ class Checklist:
 
 
 def checklist(**tests: bool) -> Checklist:
-    """Return the steps given as True, each of which its test has to hold.
+    """Return the steps given, each of which has to be True: its test holds.
 
     Raises:
         ValueError: unknown step.

@@ -1,4 +1,4 @@
-"""What of a chapter a reader sees on its page, and how long reading it takes.
+"""What a reader sees of a chapter on its page, and how long it takes to read.
 
 Code behind a click (tag ``hide-input``) is not read; what it prints is. Exercises, quiz and folded solutions are extra.
 """
@@ -101,7 +101,7 @@ def _is_plumbing(part: ast.stmt) -> bool:
 
 
 def _said(tree: ast.AST) -> Iterator[str]:
-    """Yield the strings of calls that print them, each once although `display(Markdown(...))` are two."""
+    """Yield the strings of calls that print them, each once, although `display(Markdown(...))` is two calls."""
     calls = [part for part in ast.walk(tree) if isinstance(part, ast.Call) and ast.unparse(part.func) in SENTENCES]
     constants = {one for call in calls for one in ast.walk(call) if isinstance(one, ast.Constant)}
     yield from (one.value for one in constants if isinstance(one.value, str))

@@ -78,7 +78,7 @@ def check_pages(root: Path, html: Path) -> int:
     bare = {page: count for page in pages if (count := _undescribed_images(html / f"{page}.html"))}
     if bare:
         found = ", ".join(f"{page} ({count})" for page, count in bare.items())
-        raise BookError(f"images without alternative text, set it in the cell's metadata mystnb.image.alt: {found}")
+        raise BookError(f"images without alternative text (set mystnb.image.alt in the cell's metadata): {found}")
     return len(pages)
 
 
@@ -94,7 +94,7 @@ def build(root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1
     start = time.monotonic()
     chapters = execute_chapters(root, profile, only, prepare=record_data, jobs=jobs)
     if execute_only:
-        print(f"{len(chapters)} chapters executed at profile {profile}", flush=True)
+        print(f"{len(chapters)} chapters executed with profile {profile}", flush=True)
         return None
     work, published = root / "_build" / profile, root / "_build" / "html" / profile
     made_from = sources(root, profile, chapters)
@@ -145,10 +145,10 @@ def main(argv: list[str] | None = None) -> int:
     add_profile(parser)
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
-    parser.add_argument("--jobs", type=int, metavar="N", help="chapters at a time (default: one per core)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="chapters executed at once (default: one per core)")
     options = parser.parse_args(argv)
     if options.jobs is not None and options.jobs < 1:
-        parser.error(f"--jobs {options.jobs} is not usable: give a whole number from 1")
+        parser.error(f"--jobs {options.jobs} is not usable: give a whole number of 1 or more")
     try:
         whole = not (options.execute_only or options.only)
         device = from_profile(options.profile).device

@@ -2,7 +2,7 @@
 
     python3 book/tools/check_release.py v0.1.0
 
-Needs no package, so that a release that cannot be right ends before anything is installed.
+Needs no package, so that a wrong release stops before anything is installed.
 """
 
 import argparse
@@ -16,7 +16,7 @@ UNRELEASED = "not released yet"
 
 
 def changes(root: Path, tag: str) -> str:
-    """Return what CHANGELOG.md says of the release with this tag.
+    """Return what CHANGELOG.md says about the release with this tag.
 
     Raises:
         ValueError: a file names another version, or the release is described as not made; the message names the file.

@@ -32,7 +32,7 @@ SEVERE = {"serious", "critical"}
 COLOURS = {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}  # rules that a theme can break
 REQUIRED = ("404.html", "sitemap.xml")  # made by extensions of _config.yml
 VIDEO_BYTES = 1_000_000  # larger videos load slowly on a phone
-# For a container without a GPU, and without network requests but for the pages.
+# For a container without a GPU, and without network requests except for the pages.
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
@@ -41,7 +41,7 @@ BROWSERS = 2  # in parallel; each uses a core
 Check = Callable[[Page, str], list[str]]
 SHORT_ALT = 12  # characters; shorter alternative texts do not describe a figure
 
-# JavaScript functions that return a list of problems of the page. Pictures on the theme's buttons are no figures.
+# JavaScript functions that return a list of problems of the page. Pictures on the theme's buttons are not figures.
 FIGURES = """() => [...document.querySelectorAll('main img:not(.bd-header-article img)')].flatMap(img => {
   const name = img.currentSrc.split('/').pop().slice(0, 60);
   if (img.complete && img.naturalWidth === 0) return [`image ${name} does not load`];

@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM_PACKAGES = "binder/apt.txt"
 CELL_ID = "colab"
-# The lock's versions go to pip without their hashes, which it would then want of the local wheel too. They differ from
+# The lock's versions go to pip without their hashes, which it would also demand for the local wheel. They differ from
 # what Colab has imported already, hence the new kernel.
 SETUP = r"""# On Google Colab, gets the book and installs its library, which takes a few
 # minutes and ends with a new kernel. Anywhere else, this cell does nothing.
@@ -96,7 +96,7 @@ def copy_chapters(root: Path, folder: Path, address: str) -> list[Path]:
 def main(argv: list[str] | None = None) -> int:
     """Copy the chapters and print how many there are."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="gets the folder notebooks")
+    parser.add_argument("folder", type=Path, help="where the folder notebooks is written")
     parser.add_argument("--zip", required=True, metavar="URL", help="where the zip of `make zip` can be fetched")
     options = parser.parse_args(argv)
     try:

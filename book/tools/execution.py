@@ -266,7 +266,7 @@ def _announced(place: dict[Path, str], notebook: Path, profile: str, **options: 
 
 
 def record_data(profile: str) -> None:
-    """Record the demonstrations that the chapters share, so that it does not count in a chapter's time."""
+    """Record the demonstrations that the chapters share, so that recording does not count towards a chapter's time."""
     command = [sys.executable, "-m", "fedvla_lib.cli", "record", "--profile", profile]
     if subprocess.run(command, check=False).returncode:
         raise BookError("the demonstrations could not be recorded")

@@ -32,7 +32,7 @@ def measured_in(executed: Path) -> dict[str, float | None]:
         raise ValueError(f"{executed.name} was not executed by make book")
     if (together := notebook.metadata["fedvla"].get("at_a_time", 1)) > 1:
         text = "remove it, and run make book BOOK_JOBS=1 first"
-        raise ValueError(f"{executed.name} was executed with {together} at a time: {text}")
+        raise ValueError(f"{executed.name} was executed as one of {together} at a time: {text}")
     costs = [
         output["metadata"][MEASURED]
         for cell in notebook.cells

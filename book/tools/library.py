@@ -24,7 +24,7 @@ def modules(root: Path) -> dict[str, ast.Module]:
     """Return the library's modules by name, such as ``robot.sim``, parsed; packages are not among them.
 
     Raises:
-        ValueError: there is none: whoever checks the modules must not pass on nothing.
+        ValueError: there is none: a check of the modules must not pass on an empty list.
     """
     folder = root / PACKAGE
     files = [file for file in sorted(folder.rglob("*.py")) if not file.name.startswith("__")]
@@ -87,7 +87,7 @@ def _names(tree: ast.AST) -> dict[str, str]:
 
 
 def used_in(notebooks: Iterable[Path]) -> dict[str, list[str]]:
-    """Return by the full name of everything of the library that chapters use, which ones do, in the book's order."""
+    """Return which chapters use what of the library, by its full name, in the book's order."""
     found: dict[str, list[str]] = {}
     for path in notebooks:
         cells = nbformat.read(path, as_version=4).cells
@@ -124,7 +124,7 @@ def reference(trees: dict[str, ast.Module], described: dict[str, str]) -> str:
 def table(trees: dict[str, ast.Module], described: dict[str, str], used: dict[str, list[str]]) -> str:
     """Return a section for each package: its paragraph, and its modules in a table, with the first chapter to use each.
 
-    Nested packages stand with the one that they are in.
+    Nested packages are listed with the one that they are in.
     """
     parts = []
     for room in [ROOT_FILES, *(name for name in described if "." not in name)]:

@@ -20,7 +20,7 @@ TARGET = "_build/fedvla-book.zip"
 # Same layout as the checkout: chapters read ../book/reference.
 PACKED = ["notebooks/*.ipynb", "book/reference/**/*", "requirements.lock", "LICENSE"]
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
-# --no-deps: the lock is whole but for what `override-dependencies` in pyproject.toml leaves out, which pip would miss.
+# --no-deps: the lock lacks only what `override-dependencies` in pyproject.toml leaves out, which pip would miss.
 README = """{title}
 
 The notebooks of the book, the stored results that they read, and the packages that they import. Needs Python {python}.

@@ -25,7 +25,7 @@ def make(root: Path, name: str) -> list[Path]:
     """
     match = NAME.fullmatch(name)
     if not match:
-        raise ValueError(f"{name!r} is no chapter name: give two digits and words, such as 10_privacy")
+        raise ValueError(f"{name!r} is not a chapter name: give two digits and words, such as 10_privacy")
     number, words = match.groups()
     taken = sorted(path.name for path in (root / "notebooks").glob(f"{number}_*.ipynb"))
     if taken:

@@ -120,7 +120,7 @@ def _card_tables(account: dict) -> str:
         [[row["task"], INSTRUCTION[row["told"]], *_rate(row, "task")[1:]] for row in account["language"]],
     )
     return (
-        f"## Pretraining\n\n{made}\n## Success\n\nIn the reference lab, on seeds that no demonstration has. "
+        f"## Pretraining\n\n{made}\n## Success\n\nIn the reference lab, with seeds that no demonstration used. "
         "The first tasks are the pretraining tasks; from `lift` on they are those of the labs, without demonstrations, "
         f"so this is the base before any lab has trained.\n\n{success}\n## Does it follow instructions?\n\n"
         "Two cubes of different colours are on the table. Success is counted for one of them; the instruction names "

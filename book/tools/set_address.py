@@ -43,11 +43,11 @@ def addresses(repository: str, pages: str = "") -> dict[str, str]:
     """
     match = REPOSITORY.fullmatch(repository)
     if not match:
-        raise ValueError(f"{repository!r} is no address of a repository: give https://github.com/OWNER/REPOSITORY")
+        raise ValueError(f"{repository!r} is not the address of a repository: give https://github.com/OWNER/REPOSITORY")
     owner, name = match.groups()
     pages = pages or _github_pages(owner, name)
     if not PAGES.fullmatch(pages):
-        raise ValueError(f"{pages!r} is no address of pages: give https://HOST/ or https://HOST/FOLDER/")
+        raise ValueError(f"{pages!r} is not the address of a website: give https://HOST/ or https://HOST/FOLDER/")
     pages = pages.rstrip("/") + "/"
     found = {"repository": f"https://github.com/{owner}/{name}", "pages": pages, "folder": urlparse(pages).path}
     return found | {"binder": BINDER, "colab": COLAB}

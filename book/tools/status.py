@@ -47,7 +47,7 @@ def _chapters(stamps: dict[Path, dict], profile: str) -> str:
     total = sum(stamp.get("seconds", 0) for stamp in stamps.values())
     rows.append(["**total**", f"**{total:.0f}**", "", ""])
     side_by_side = max((stamp.get("at_a_time", 1) for stamp in stamps.values()), default=1)
-    shared = f", {side_by_side} chapters in parallel: each took longer than alone" if side_by_side > 1 else ""
+    shared = f", {side_by_side} chapters in parallel: each took longer than it would alone" if side_by_side > 1 else ""
     return f"Profile `{profile}`{shared}.\n\n" + table(["chapter", "seconds", "seed", "executed (UTC)"], rows)
 
 

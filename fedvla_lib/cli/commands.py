@@ -117,7 +117,7 @@ def run(options: argparse.Namespace) -> None:
     config = _new_or_resumed(options)
     if options.engine == "simulation":
         return _print_rounds(simulation.run_simulation(config))
-    jobs = _jobs(options, config.device) if options.jobs or total_steps(config) >= 400 else 1  # fewer end sooner
+    jobs = _jobs(options, config.device) if options.jobs or total_steps(config) >= 400 else 1  # not worth it for fewer
     _print_rounds(inline.run_inline(config, jobs=jobs))
 
 
@@ -134,7 +134,7 @@ def _new_or_resumed(options: argparse.Namespace) -> Config:
     if given := sorted((SETTINGS - {"num_threads"}) & set(vars(options))):
         raise ValueError(f"--{given[0].replace('_', '-')} cannot be given with --resume: a run keeps its settings")
     if not (options.resume / "config.json").is_file():
-        raise ValueError(f"--resume {options.resume}: no run folder there, it has no config.json")
+        raise ValueError(f"--resume {options.resume} is not a run folder: it has no config.json")
     threads = {"num_threads": options.num_threads} if "num_threads" in vars(options) else {}
     chosen = replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
     with hold(options.resume):  # fails here rather than after the engine has started its processes
@@ -155,7 +155,7 @@ def superlink(options: argparse.Namespace) -> int:
     from fedvla_lib.engines import superlink_service as service
 
     if not os.environ.get("FLWR_HOME"):
-        raise ValueError("FLWR_HOME is not set: run `. flower/env.sh` first, so that your own Flower settings stay")
+        raise ValueError("FLWR_HOME is not set: run `. flower/env.sh` first, so that your own Flower settings are kept")
     home = Path(os.environ["FLWR_HOME"])
     if options.action in ("up", "down"):
         print({"up": service.up, "down": service.down}[options.action](home))

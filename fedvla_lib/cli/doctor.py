@@ -1,7 +1,7 @@
 """Check whether this machine can run the book, and say how to fix what is missing.
 
 Each check is one function that returns one `Check` and raises no error for the fault it looks for. Heavy packages are
-imported inside the checks (MuJoCo in a separate process, which a wrong driver kills), so that the doctor still runs
+imported inside the checks (MuJoCo in a separate process, since a wrong driver kills it), so that the doctor still runs
 when one of them is broken. It does not know torch, LeRobot or Flower beyond their version numbers.
 """
 

@@ -1,7 +1,7 @@
 """The entry point of `fedvla`.
 
 Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line that says what is kept and status 130.
-`kill` and closing the terminal are handled as Ctrl-C.
+`kill` and closing the terminal are handled like Ctrl-C.
 """
 
 import argparse

@@ -103,14 +103,14 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
     ]),
     (commands.config, "print the settings as TOML for flwr run --run-config", NOTHING, [PROFILE]),
     (commands.train, "train a policy without federation: on all data, or on one client's partition",
-     "checkpoints are in the run folder; fedvla train --resume FOLDER, --client and --steps as before, continues", [
+     "checkpoints are in the run folder; fedvla train --resume FOLDER with the same --client and --steps continues", [
         _flag("--client", "train on client K's partition only", "K"),
         _flag("--steps", "gradient steps (default: num-server-rounds times local-steps)", "N"), RESUME, PROFILE,
     ]),
     (commands.run, "run federated training with simulated clients", ROUNDS, [
         _flag("--engine", "inline: one client after the other, in this process; simulation: Flower's simulation, in "
               "several processes", choices=("inline", "simulation"), default="inline"),
-        _jobs("clients on the engine inline"), RESUME, PROFILE,
+        _jobs("clients of the inline engine"), RESUME, PROFILE,
     ]),
     (commands.deploy, "run a federation on a SuperLink and SuperNodes, each a process on this machine",
      f"every process is stopped; {ROUNDS}", [

@@ -2,7 +2,7 @@
 
 Decoding a random video frame takes milliseconds, reading a row of an array microseconds, and training visits every
 frame many times. `open_store` therefore reads and checks a data set once, writes one ``.npy`` per camera into the cache
-and later only maps the files. This module does not know the data set's file format, nor batches.
+and later only maps the files. This module knows neither the data set's file format nor batches.
 """
 
 import hashlib

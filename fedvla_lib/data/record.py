@@ -36,7 +36,7 @@ MAX_ATTEMPTS = 20  # seeds tried per episode until the expert succeeds
 
 @dataclass(frozen=True)
 class Scenes:
-    """Where the episodes of a recording are shown."""
+    """Where the episodes of a recording take place."""
 
     num_labs: int = 1  # labs to record in, in turn; with more than one, the column ``lab_index`` holds the lab
     one_task_per_lab: bool = False  # lab k records only task k, counted modulo the number of tasks

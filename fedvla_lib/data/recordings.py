@@ -23,7 +23,7 @@ def resolve(config: Config) -> Path | str:
 
 
 def record_into(root: Path, config: Config) -> Path:
-    """Record the demonstrations that a run's settings describe into `root`, and return it; errors as of `record`."""
+    """Record the demonstrations that a run's settings describe into `root`, and return it; errors as in `record`."""
     scenes = {"image_size": config.image_size, "seed": config.seed, "num_labs": config.num_labs}
     scenes["one_task_per_lab"] = config.one_task_per_lab
     return record(task_names(config), config.episodes_per_task, root, **scenes)

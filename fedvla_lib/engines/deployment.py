@@ -1,7 +1,7 @@
 """A deployment on this machine: a SuperLink and one SuperNode per client, each in its own process.
 
 A deployment on several hosts differs only in the address and in who starts the processes; certificates, keys, node
-config and app are the same. All processes are stopped at the end, also on Ctrl-C and when the run fails.
+config and app are the same. All processes are stopped at the end, even on Ctrl-C or when the run fails.
 """
 
 import json
@@ -70,7 +70,7 @@ class Deployment:
         superlink.require_completed(self.link, self.link.submit(app, timeout_s=timeout_s, watch=watch))
 
     def kill_nodes(self) -> None:
-        """Kill the SuperNodes, which would otherwise try for long to take leave of the SuperLink."""
+        """Kill the SuperNodes, which would otherwise spend a long time signing off from the SuperLink."""
         for node in self.nodes.values():
             processes.stop(node, (signal.SIGKILL,))
 

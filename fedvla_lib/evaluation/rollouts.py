@@ -103,14 +103,14 @@ def success_rate(rows: Sequence[dict[str, Any]]) -> float:
 def roll_out_in_places(
     bundle: Bundle, config: Config, seeds: Sequence[int], trained_in: int | None = None
 ) -> list[dict[str, Any]]:
-    """Evaluate one model of labs with one task each; rows as of `evaluate`, with a column place.
+    """Evaluate one model of labs with one task each; rows as in `evaluate`, with a column place.
 
-    Of the seeds, lab k takes every `num_labs`-th from the k-th, on its own task: once in the lab (place "own"), once in
+    Lab k takes every `num_labs`-th seed from the k-th, on its own task: once in the lab (place "own"), once in
     the next lab, in which nobody recorded (place "unseen").
 
     Args:
         trained_in: number of the only lab that the model saw. It is measured at that lab's task, and on a quarter of
-            the seeds at every other task, in the labs that have it (place "others"). None: at all labs' tasks.
+            the seeds at each of the other tasks, in the labs that have it (place "others"). None: at all labs' tasks.
     """
     tasks, there, rows = task_names(config), labs(config.num_labs + 1), []
     actor = PolicyActor(bundle, config.seed)

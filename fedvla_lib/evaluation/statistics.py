@@ -19,7 +19,7 @@ DISTINCT = 8  # distinct values that the bootstrap of a mean needs
 
 def check_metrics(metrics: Sequence[str], known: Collection[str]) -> list[str]:
     """Return the metrics; raise ValueError if one of them is not in `known`."""
-    for metric in metrics or [""]:  # none is no choice either
+    for metric in metrics or [""]:  # an empty list is not a choice either
         if metric not in known:
             raise ValueError(f"unknown metric {metric!r}: choose from {', '.join(known)}")
     return list(metrics)

@@ -131,7 +131,7 @@ def _federated(config: Config, seeds: Sequence[int]) -> Measured:
 
 
 def _costs(run: Path) -> dict[str, Any]:
-    """Return what training a federation cost, as fields of `Measured`; of personal parts, the shared ones' steps."""
+    """Return what training a federation cost, as fields of `Measured`; steps of the shared parts only."""
     replies, train = (run_folder.read_metrics(run, kind) for kind in ("replies", "train"))
     return {
         "steps": {GLOBAL: run_folder.counted_steps(run)},

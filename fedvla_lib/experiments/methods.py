@@ -3,7 +3,7 @@
 ``base`` is the starting model; ``local-only`` trains one client on its own episodes; ``federated`` is a federated run
 over all clients; ``centralized`` trains on all clients' episodes. Unless `Config.alone_steps` says otherwise,
 *centralized* gets the total gradient steps of the federation, *local-only* that total over the number of clients.
-Results are cached by settings and by the digest of the code that determines them, so a change of either trains again.
+Results are cached by settings and by the digest of the code that determines them, so changing either means retraining.
 """
 
 import hashlib

@@ -48,7 +48,7 @@ def cached(loaders: Loaders, limit: int | None = None) -> Loaders:
     """Return loaders that open the frames and build the policy once and share them between clients.
 
     Args:
-        limit: most data sets, and most policies, that stay in memory; None keeps all.
+        limit: maximum number of data sets, and of policies, kept in memory; None keeps all.
     """
     keep = functools.lru_cache(limit)
     # Statistics hold arrays, which are not hashable; their text form is, and it is exact.

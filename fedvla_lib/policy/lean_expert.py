@@ -1,8 +1,8 @@
 """The action expert's pass over stored prefixes, written again with few operations.
 
-`SmolVLAPolicy` makes rotary tables, masks and positions anew in every layer, repeats keys for each query of a group and
+`SmolVLAPolicy` recomputes rotary tables, masks and positions in every layer, repeats keys for each query of a group and
 lets autograd record thousands of small operations. Here tables and masks are made once for a batch, queries that share
-keys stand in one matrix, and the parts that are made of many small operations have their derivative written out. Loss
+keys form one matrix, and the parts that are made of many small operations have their derivative written out. Loss
 and gradients equal the policy's own; `refusal` says for which policies.
 """
 
@@ -208,7 +208,7 @@ def _turn(x: Tensor, cos: Tensor, sin: Tensor, out: Tensor) -> Tensor:
 def _attend(queries: Tensor, keys: Tensor, values: Tensor, shared: _Shared) -> tuple[Tensor, Tensor, Tensor]:
     """Attention of (B, heads, T, head dim) queries, not yet turned, to the (B, groups, keys, head dim) of their group.
 
-    Queries of a group share their keys, so they stand in one matrix and the keys are not repeated.
+    Queries of a group share their keys, so they form one matrix and the keys are not repeated.
 
     Returns:
         The queries, turned, (B * groups, heads per group * T, head dim); what they attend to, (B * T, heads * head

@@ -90,8 +90,8 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
 def use_threads(config: Config, policy: SmolVLAPolicy) -> None:
     """Set the number of torch threads of this process; the order of sums, and so their last bits, depends on it.
 
-    At nano size a second thread makes a step hardly faster, and several times slower as soon as another process wants
-    the core: there cores are for processes side by side.
+    At nano size a second thread barely speeds up a step, and makes it several times slower as soon as another process
+    wants the core: there cores are for processes side by side.
     """
     small = sum(parameter.numel() for parameter in policy.parameters()) < SMALL
     torch.set_num_threads(config.num_threads or (1 if small else granted_cores()))
@@ -152,7 +152,7 @@ def _random_nano(config: Config) -> SmolVLAPolicy:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         policy = SmolVLAPolicy(settings)
-        # At the default (0.02) a patch's position is lost against its content; with this the model learns to locate.
+        # At the default (0.02) a patch's position is drowned out by its content; with this the model learns to locate.
         embeddings = policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings
         torch.nn.init.normal_(embeddings.position_embedding.weight, std=POSITION_STD)
     return policy.to(config.device)

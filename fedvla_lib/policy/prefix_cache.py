@@ -84,7 +84,7 @@ def squared_errors(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, t
 
 @torch.no_grad()
 def denoise(bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
-    """Return the action chunks that the policy makes of noise, as `predict_action_chunk`: (B, chunk, 6) in degrees."""
+    """Return the policy's action chunks for this noise, as `predict_action_chunk`: (B, chunk, 6) in degrees."""
     config, whole = bundle.policy.config, noise.shape[-1]
     chunk = euler_integrate(lambda x, t: _velocity(bundle, prefix, x, t, whole), noise, config.num_steps)
     return bundle.postprocess(chunk[..., : config.action_feature.shape[0]])

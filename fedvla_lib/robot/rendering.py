@@ -48,7 +48,7 @@ class SceneRenderer(mujoco.Renderer):
         return image[::-1].copy()  # OpenGL's first row is the lowest
 
     def _background(self, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Return the layer of what is fixed to the world, drawn anew if camera, light, a place or a colour changed."""
+        """Return the layer of what is fixed to the world, redrawn if camera, light, a place or a colour changed."""
         shown = (
             data.cam_xpos, data.cam_xmat, model.cam_fovy, data.light_xpos, data.light_xdir, model.light_diffuse,
             model.vis.headlight.ambient, model.vis.headlight.diffuse, model.mat_rgba, model.geom_rgba[self._fixed],
@@ -78,7 +78,7 @@ class SceneRenderer(mujoco.Renderer):
     def close(self) -> None:
         """Free the buffers in this renderer's own OpenGL context; MuJoCo frees them in whichever one is current.
 
-        Buffer ids are per context: freeing in another's deletes that renderer's buffers, and it returns garbage then.
+        Buffer ids are per context: freeing them in another's frees that renderer's buffers, and it returns garbage.
         """
         if self._gl_context:
             self._gl_context.make_current()

@@ -42,7 +42,7 @@ WRONG = {
         (
             "def unpaired(left, right):\n"
             "    odd = set(left) ^ set(right)\n    return [a for a in odd if a[0] in {task for task, _ in left}]",
-            "may also have made more",
+            "may also have run more",
         ),
     ],
     "three_budgets": [

@@ -37,7 +37,7 @@ WRONG = {
         (
             "def resting_point(a, b, rate, steps):\n"
             "    left = (1 - rate * a) ** steps\n    return left @ b / left.sum()",
-            "not gone",
+            "not by that gone",
         ),
         ("def resting_point(a, b, rate, steps):\n    return (1 - (1 - rate * a) ** steps) @ b", "updates cancel"),
     ],

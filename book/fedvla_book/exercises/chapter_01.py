@@ -71,12 +71,12 @@ def _pair(given: Any) -> tuple[Any, Any]:
 
 
 def normalised(turn: Callable[..., np.ndarray]) -> None:
-    """``turn(actions, episode_index, train_ids)`` is all frames, with mean and standard deviation of training ones."""
+    """``turn(actions, episode_index, train_ids)`` is all frames, normalised by the training frames' statistics."""
     episode_index = np.repeat([0, 1, 2, 3], [8, 5, 12, 9])
     actions = np.random.default_rng(3).normal(20.0 * episode_index[:, None], 1.0 + np.arange(6), (34, 6))
     for train_ids in ([0, 2], [3, 1, 0]):
         given, seen = np.asarray(turn(actions, episode_index, train_ids)), np.isin(episode_index, train_ids)
-        expect(given.shape == actions.shape, "All frames are wanted, held-out ones too, in the order they have.")
+        expect(given.shape == actions.shape, "All frames are wanted, held-out ones too, in their original order.")
         expect(
             not close(given, _scaled(actions, actions)), "Your statistics include held-out frames: this is the leak."
         )
@@ -96,7 +96,7 @@ def _scaled(actions: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def rollouts_needed(count: Callable[[float, float], int]) -> None:
-    """``count(rate, width)`` is the smallest number of attempts whose Wilson interval is narrower than `width`."""
+    """``count(rate, width)`` is the smallest number of rollouts whose Wilson interval is narrower than `width`."""
     certain, even = count(1.0, 0.1), count(0.5, 0.2)
     expect(certain != 1, "At a rate of 1 your interval has no width; the square root in Wilson's formula is never 0.")
     expect(even != _fewest(0.5, 0.4), "The width is from low to high: twice the term after ±.")
@@ -111,7 +111,7 @@ def rollouts_needed(count: Callable[[float, float], int]) -> None:
 
 
 def _fewest(rate: float, width: float, z: float = 1.96) -> int:
-    """Where the squared width, a quadratic in the number of attempts, falls below the one that is asked for."""
+    """Where the squared width, a quadratic in the number of rollouts, falls below the one that is asked for."""
     ahead, behind = 4 * z**2 * rate * (1 - rate) / width**2, z**4 / width**2
     half = (ahead - 2 * z**2) / 2
     return int(half + np.sqrt(half**2 + behind - z**4)) + 1

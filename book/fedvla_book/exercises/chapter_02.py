@@ -13,7 +13,7 @@ def dealt(deal: Callable[[Sequence[int], int], list[list[int]]]) -> None:
     parts = [list(part) for part in deal(list(ids), 3)]
     expect(len(parts) == 3, f"There are 3 clients, and you return {len(parts)} lists.")
     everything = [episode for part in parts for episode in part]
-    expect(sorted(everything) == sorted(ids), "Each episode must be with exactly one client.")
+    expect(sorted(everything) == sorted(ids), "Each episode must belong to exactly one client.")
     sizes = sorted(len(part) for part in parts)
     expect(sizes[-1] - sizes[0] <= 1, "One client has far more: deal by the position in the list, not by the id.")
     expect(parts == [[0, 9, 21], [3, 12], [6, 15]], "Sort the ids first, then go round: first, second, third, first...")

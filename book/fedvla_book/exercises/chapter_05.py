@@ -17,7 +17,7 @@ def incomplete(find: Callable[..., Sequence[int]]) -> None:
     found = set(given.ravel().tolist())
     expect(not found & {0, 5}, "Rollouts 0 and 5 are complete: all three lengths agree.")
     expect(found != {1}, "A video that opens can still lack its end: compare its length with that of the rollout.")
-    expect(4 in found, "A video can also be too long, such as one of another rollout.")
+    expect(4 in found, "A video can also be too long, for example one from another rollout.")
     expect(3 in found, "Check the row, too: a video and a trajectory that agree may belong to another rollout.")
     expect(found == {1, 2, 3, 4, 6}, f"1, 2, 3, 4 and 6 have a length that differs, you list {sorted(found)}.")
     expect(len(find(steps, steps, steps)) == 0, "If all lengths agree, the list has to be empty.")
@@ -96,7 +96,7 @@ def misled(share: Callable[[np.ndarray, np.ndarray], float]) -> None:
 
 
 def visible(difference: Callable[[int, float], float]) -> None:
-    """``difference(rollouts, rate)`` is the difference that many rollouts per model detect in 80 % of experiments."""
+    """``difference(rollouts, rate)`` is the difference this many rollouts per model detect in 80 % of experiments."""
     for rollouts, rate in ((50, 0.6), (400, 0.7), (30, 0.5)):
         given, right = difference(rollouts, rate), _visible(rollouts, rate, 0.8)
         half = _visible(rollouts, rate, 0.5)

@@ -35,13 +35,13 @@ def unpaired(find: Callable[[Sequence, Sequence], Sequence]) -> None:
     pairs = all(isinstance(rollout, tuple | list) and len(rollout) == 2 for rollout in given)
     expect(pairs, "A rollout is a task and a seed: the same seed in another task is another rollout.")
     found = {tuple(rollout) for rollout in given}
-    expect(found, "As many rollouts and the same tasks are not enough: look at each (task, seed).")
+    expect(found, "Equally many rollouts and the same tasks are not enough: look at each (task, seed).")
     shared = {("lift", 1), ("lift", 2), ("push", 1)}
     expect(not found & shared, "Both methods ran a rollout that you list: their order does not matter.")
     expect(len(found) == 2, "Both sides count: what only the left method ran, and what only the right method ran.")
     expect(not list(find(left, left[::-1])), "The same rollouts in another order can all be paired.")
     more = find(left, [*left, ("stack", 7)])
-    expect([tuple(rollout) for rollout in more] == [("stack", 7)], "A method may also have made more than the other.")
+    expect([tuple(rollout) for rollout in more] == [("stack", 7)], "A method may also have run more than the other.")
 
 
 def three_budgets(budgets: Callable[[int, int, int, float], Sequence[float]]) -> None:
@@ -67,7 +67,7 @@ def demonstrations_needed(needed: Callable[[Sequence[int], Sequence[float], floa
         given = needed(counts, rates, wanted)
         expect(np.shape(given) == (), "Expected one number.")
         straight = np.interp(wanted, rates, counts)
-        expect(not close(given, straight) or close(straight, right), "Linear in the logarithm of the count, not in it.")
+        expect(not close(given, straight) or close(straight, right), "Linear in the logarithm, not in the count.")
         expect(not close(given, np.log2(right)), "That is the logarithm: turn it back into a count.")
         expect(close(given, right), f"At which count does the curve of labs alone pass {wanted}?")
     beyond = needed(counts, rates, 0.9)

@@ -30,7 +30,7 @@ def resting_point(rest: Callable[[np.ndarray, np.ndarray, float, int], float]) -
         )
         expect(steps == 1 or not close(given, optimum), "That is the optimum: only a single local step leads there.")
         expect(
-            not close(given, left @ wanted / left.sum()), "You weight by the share of the way that is left, not gone."
+            not close(given, left @ wanted / left.sum()), "You weight by the share of the way left, not by that gone."
         )
         right = _averaged(curvature, wanted, rate, steps)
         expect(

@@ -38,7 +38,7 @@ def round_seconds(last: Callable[[dict[str, tuple[int, ...]], int, int, float], 
     numbers = 72 * 96 + 72 + 1
     for down, up, line in [(16, 8, 20.0), (32, 32, 100.0)]:
         given = last(dict(shapes), down, up, line)
-        expect(np.shape(given) == (), "Expected one number: the seconds of both ways together.")
+        expect(np.shape(given) == (), "Expected one number: the seconds for both directions together.")
         bits, right = given * line * 1e6, numbers * (down + up)
         expect(not close(bits, right / 8), "Eight times too short: the line speed is in bits, and you count bytes.")
         expect(not close(bits, 8 * right), "Eight times too long: sizes are in bits here, and so is the line speed.")

@@ -34,10 +34,10 @@ def exact_p(p_value: Callable[[int, int], float]) -> None:
     for only_left, only_right in ((1, 9), (12, 4), (0, 5)):
         given, pairs = p_value(only_left, only_right), only_left + only_right
         right = binomtest(only_left, pairs).pvalue
-        expect(not close(given, right / 2), "That is one side: a split as uneven the other way counts as well.")
+        expect(not close(given, right / 2), "That is one side: an equally uneven split the other way counts as well.")
         alone = 2 * binom.pmf(only_left, pairs, 0.5)
         expect(not close(given, alone) or only_left == 0, "More uneven splits count too: add up their probabilities.")
-        fair = f"toss a fair coin {pairs} times: how often is the split at least so uneven?"
+        fair = f"toss a fair coin {pairs} times: how often is the split at least that uneven?"
         expect(close(given, right), f"For {only_left} to {only_right}, {fair}")
     expect(close(p_value(7, 7), 1.0), "A split of 7 to 7 has p = 1, and no probability is above 1.")
     expect(close(p_value(0, 0), 1.0), "Without discordant pairs there is no evidence of a difference: p = 1.")

@@ -61,9 +61,9 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
 
 def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draw differences in success of one method to others, a panel for each other method, a row for each partition.
+    """Draw differences in success between a method and others, a panel for each other method, a row for each partition.
 
-    Panels have separate scales, since differences to close and to bad methods are of different size.
+    Panels have separate scales, since differences from similar and from poor methods differ in size.
 
     Args:
         table: columns partition, method, other, difference, low, high; one `method` in all rows.

@@ -79,7 +79,7 @@ def trajectories(by_name: dict[str, np.ndarray], *, axes: Sequence[Axes] | None 
 def frame_strips(
     images: dict[str, np.ndarray], *, count: int = 6, axes: Sequence[Axes] | None = None
 ) -> Sequence[Axes]:
-    """Draw a `frame_strip` of each camera, camera -> (T, H, W, 3), below each other."""
+    """Draw a `frame_strip` of each camera, camera -> (T, H, W, 3), one below the other."""
     if axes is None:
         _, grid = plt.subplots(len(images), 1, figsize=(WIDTH, 1.7 * len(images)), layout="constrained", squeeze=False)
         axes = grid.ravel()
@@ -127,12 +127,12 @@ def chunk(
 
 
 def likeness(gaps_s: np.ndarray, distances: np.ndarray, elsewhere: float, *, ax: Axes | None = None) -> Axes:
-    """Draw the difference of two frames of an episode against their time distance; `elsewhere`: to another episode."""
+    """Draw the difference between two frames of an episode against their time gap; `elsewhere`: to another episode."""
     ax = ax or new_axes()
     ax.plot(gaps_s, distances, "o-", label="same episode")
     ax.axhline(elsewhere, color=PALETTE[1], linestyle="--", label="another episode, same task and moment")
     ax.set_ylim(bottom=0)
     ax.set_xlabel("time between the two frames [s]")
-    ax.set_ylabel("mean difference [grey levels of 255]")
+    ax.set_ylabel("mean difference [grey levels out of 255]")
     ax.legend(frameon=False)
     return ax

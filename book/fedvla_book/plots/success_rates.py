@@ -70,7 +70,7 @@ def power(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     ax.set_xscale("log")
     ax.set_ylim(0, 1.02)
     ax.set_xlabel("rollouts per model (log scale)")
-    ax.set_ylabel("power: share of experiments that detect it")
+    ax.set_ylabel("power: share of experiments that detect the difference")
     ax.legend(frameon=False)
     return ax
 

@@ -189,7 +189,7 @@ def architecture(table: pd.DataFrame, shapes: dict[str, Sequence[int]], *, ax: A
     """Draw SmolVLA's parts with their parameters, and the tensor shape on each arrow.
 
     Args:
-        table: columns part, parameters, trainable, as of `tables.module_table`.
+        table: columns part, parameters, trainable, as in `tables.module_table`.
         shapes: by arrow, as named in `ARROWS`; arrows may lack one.
     """
     if ax is None:

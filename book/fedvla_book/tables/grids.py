@@ -86,7 +86,7 @@ def _held_out(rows: pd.DataFrame, method: str, other: str) -> dict[str, float]:
 
 
 def at_own_task(rows: pd.DataFrame) -> pd.Series:
-    """Return for each rollout whether a local-only client made it at its own task.
+    """Return for each rollout whether a local-only client ran it on its own task.
 
     With partition `task` client k has task k in alphabetical order, modulo the number of tasks, as assigned by
     `data.partition.partition`. False for rollouts of other methods.

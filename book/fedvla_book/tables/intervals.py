@@ -12,7 +12,7 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
     """Pivot the rollouts of one method: a row for each training seed (`run`), a column for each (task, seed), 0 or 1.
 
     Raises:
-        ValueError: a rollout occurs twice, or the training seeds did not make the same rollouts.
+        ValueError: a rollout occurs twice, or the training seeds did not run the same rollouts.
     """
     if rows.duplicated(["run", "task", "seed"]).any():
         raise ValueError("a training seed ran a (task, seed) twice: give the rollouts of one method and partition")
@@ -38,7 +38,7 @@ def success_interval(rows: pd.DataFrame, confidence: float = CONFIDENCE) -> tupl
 def over_seeds(values: pd.DataFrame, confidence: float = CONFIDENCE) -> dict[str, float]:
     """Mean of outcomes (or paired differences) with Student's interval over training seeds and rollouts.
 
-    Every seed makes every rollout (crossed random effects). With S seeds and n rollouts the variance of the mean is
+    Every seed runs every rollout (crossed random effects). With S seeds and n rollouts the variance of the mean is
     (MS_seeds + MS_rollouts - MS_rest) / (S n), with Satterthwaite's degrees of freedom (1946). Simulated coverage with
     5 seeds and 100 rollouts is 93 to 97 %; a bootstrap over so few seeds is too narrow where seeds matter and too wide
     where they do not.

@@ -24,8 +24,8 @@ def read_results(folder: Path) -> pd.DataFrame:
     """Return a row for each rollout of the last model of each cell in `folder`, with columns that describe the cell.
 
     train_s and in_a_row_s are NaN if the stamp lacks them. demonstrations: how many the settings ask of each lab. place
-    is where a rollout was made: own, unseen or others (`evaluation.rollouts.roll_out_in_places`); own where no lab has
-    a task of its own. steps_in_all and steps_in_a_row are gradient steps of the model that made the rollout. `counted`
+    is where a rollout was run: own, unseen or others (`evaluation.rollouts.roll_out_in_places`); own where no lab has
+    a task of its own. steps_in_all and steps_in_a_row are gradient steps of the model that was rolled out. `counted`
     tells whether they were counted while training; for older cells they are derived from the settings, and a local-only
     client gets its share of the total.
 
@@ -45,7 +45,7 @@ def cell_folders(folder: Path) -> Iterator[Path]:
 
 
 def cell_columns(cell: Path) -> dict[str, Any]:
-    """Return what a cell's stamp says of it, by the name of the column."""
+    """Return what a cell's stamp says about it, by column name."""
     stamp = run_folder.read_stamp(cell)
     seconds = {key: float("nan") if stamp.get(key) is None else stamp[key] for key in ("train_s", "in_a_row_s")}
     return {key: stamp[key] for key in OF_CELL} | {"run": stamp["seed"], **seconds}

@@ -7,6 +7,7 @@ import pandas as pd
 
 from fedvla_book.tables.grids import resampled_means
 from fedvla_book.tables.intervals import by_run
+from fedvla_book.tables.results import LOCAL_ONLY, OWN
 from fedvla_lib.evaluation.statistics import CONFIDENCE
 
 
@@ -33,6 +34,22 @@ def demonstrations_to_match(counts: Sequence[int], rates: Sequence[float], wante
     logs = np.log2(counts)
     share = (wanted - best[reached - 1]) / (best[reached] - best[reached - 1])
     return float(2 ** (logs[reached - 1] + share * (logs[reached] - logs[reached - 1])))
+
+
+def alone_at_best(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with one method of labs alone, `local-only`: those that trained until more steps no longer help.
+
+    For each number of demonstrations these are the labs alone whose number of steps gave the most successes on their
+    own task and place; the other rows of labs alone are left out. To choose the best favours labs alone a little.
+
+    Args:
+        rows: of `results.read_results`.
+    """
+    alone = rows[rows.kind == LOCAL_ONLY]
+    rates = alone[alone.place == OWN].groupby(["demonstrations", "method"]).success.mean().unstack()
+    best = rates.idxmax(axis=1)
+    kept = alone[alone.method == alone.demonstrations.map(best)].assign(method=LOCAL_ONLY)
+    return pd.concat([rows[rows.kind != LOCAL_ONLY], kept], ignore_index=True)
 
 
 def worth(

@@ -1,4 +1,4 @@
-"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or one that Flower has not."""
+"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or one that Flower lacks."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ def build_strategy(config: Config, **checked: Any) -> Checked:
         "fedyogi": (FedYogi, {"eta": rate, "tau": ADAPTIVITY}),
         # a Nesterov step along the averaged update (Douillard et al. 2023, https://arxiv.org/abs/2311.08105)
         "diloco": (DiLoCo, {"server_learning_rate": rate, "server_momentum": config.server_momentum}),
-        # a longer step the more the updates disagree (Jhunjhunwala et al. 2023, https://arxiv.org/abs/2301.09604)
+        # a longer step if the updates disagree more (Jhunjhunwala et al. 2023, https://arxiv.org/abs/2301.09604)
         "fedexp": (FedExP, {}),
         # the median of each coordinate, every client counting alike (Yin et al. 2018, https://arxiv.org/abs/1803.01498)
         "fedmedian": (FedMedian, {}),

@@ -23,7 +23,7 @@ class OuterStep(FedAvg):
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
-        """Keep the global arrays, from which updates are counted."""
+        """Keep the global arrays, relative to which updates are taken."""
         self.start_of_round = messages.unpack_arrays(arrays)
         return super().configure_train(server_round, arrays, config, grid)
 
@@ -63,7 +63,7 @@ class DiLoCo(OuterStep):
 
 
 class FedExP(OuterStep):
-    """The longer a step the more the updates differ: eta = max(1, sum_k p_k ||u_k||^2 / (2 (||u||^2 + epsilon))).
+    """A longer step if the updates differ more: eta = max(1, sum_k p_k ||u_k||^2 / (2 (||u||^2 + epsilon))).
 
     Jhunjhunwala et al. 2023, https://arxiv.org/abs/2301.09604, with equal p_k.
     """

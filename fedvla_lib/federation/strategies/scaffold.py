@@ -53,7 +53,7 @@ class CheckedScaffold(Checked, FedAvg):
     """SCAFFOLD (Karimireddy et al. 2020, https://arxiv.org/abs/1910.06378): FedAvg with control variates.
 
     The server keeps c = sum_k p_k c_k over all clients and sends it with the model; `ControlVariates` is the client
-    side. The paper weighs clients equally; here p_k = n_k / sum n over all clients, sampled or not, as in averaging,
+    side. The paper weights clients equally; here p_k = n_k / sum n over all clients, sampled or not, as in averaging,
     because otherwise the optimum of the averaged loss would not be a fixed point.
     """
 
