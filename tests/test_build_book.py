@@ -276,7 +276,7 @@ def write_pages(html: Path, one: str) -> None:
 @pytest.mark.parametrize("image", ['<img src="a.png">', '<img alt="" src="a.png">', '<img alt="../_images/a.png">'])
 def test_images_need_a_description(project, image):
     write_pages(project / "html", one=image)
-    with pytest.raises(BookError, match=r"mystnb.image.alt: notebooks/one \(1\)"):
+    with pytest.raises(BookError, match=r"cell's metadata\): notebooks/one \(1\)"):
         build_book.check_pages(project, project / "html")
 
 
