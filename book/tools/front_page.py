@@ -8,9 +8,10 @@ import nbformat
 import numpy as np
 import pandas as pd
 
+import status
 from execution import BookError
 from fedvla_book import plots, tables
-from fedvla_book.sentences import points, rate
+from fedvla_book.sentences import interval, points, rate
 from fedvla_book.tables import results
 from fedvla_book.tables.worth import alone_at_best, worth
 from fedvla_book.video_player import AT_ONCE, CONTROLS
@@ -52,7 +53,7 @@ def compared(folder: Path) -> pd.DataFrame:
 
 
 def headline(rows: pd.DataFrame) -> str:
-    """What the stored runs found, for the front page: a list of statements, and a figure.
+    """What the stored runs found, for the front page: a figure, a table and statements.
 
     Raises:
         BookError: federated and centralized training differ in samples or in steps in a row, and the text says equal.
@@ -60,16 +61,48 @@ def headline(rows: pd.DataFrame) -> str:
     planned, fair = rows[rows.place == results.OWN], alone_at_best(rows)
     home, away = (fair[fair.place == place] for place in (results.OWN, "unseen"))
     labs, tasks = home.lab.nunique(), home.task.nunique()
-    statements = (
-        _main(planned), _others(home), _worth(home), _away(away), _pooled(home), _paid(planned, labs),
-        _open(rows, fair, tasks),
-    )  # fmt: skip
+    statements = (_main(planned), _away(away), _pooled(home), _paid(planned, labs), _open(rows, fair, tasks))
     return "\n".join([
-        f"**Is it worth federating?** {labs} labs, one of {tasks} tasks in each; nano model, simulation. "
-        "Brackets are 95 % intervals over training seeds, each with a recording of its own, and over rollouts; "
+        f"**Is it worth federating?** {labs} labs, one of {tasks} tasks in each; nano model, simulation.\n",
+        _outcome_figure(), "", gain(home),
+        "*Worth* is the number of demonstrations with which a lab alone does as well as in the federation. Brackets "
+        "are 95 % intervals over training seeds, each with a recording of its own, and over rollouts; "
         "{doc}`/notebooks/06_federated_vs_centralized` explains them.\n",
-        *(f"- {said}" for said in statements), "", _outcome_figure(),
+        *(f"- {said}" for said in statements),
     ])  # fmt: skip
+
+
+def gain(home: pd.DataFrame) -> str:
+    """A table of success on a lab's own task, in its own place, by demonstrations, whoever is ahead.
+
+    Args:
+        home: of `alone_at_best`, in a lab's own place.
+    """
+    rates = results.summary(home, BY).set_index(["method", "demonstrations"])
+    alone, pooled = gaps(home, FEDERATED, ALONE), gaps(home, FEDERATED, POOLED)
+    value = worth(home, FEDERATED, ALONE, seed=0).set_index("demonstrations")
+    head = ["demonstrations a lab", "alone", "federation", "minus alone", "minus pooled", "worth"]
+    lines = [
+        [f"{count:.0f}", percent(rates.loc[(ALONE, count)]), percent(rates.loc[(FEDERATED, count)]),
+         alone.get(count, ""), pooled.get(count, ""), _worth(value.loc[count], max(value.index))]
+        for count in value.index
+    ]  # fmt: skip
+    return status.table(head, lines)
+
+
+def gaps(rows: pd.DataFrame, method: str, other: str) -> dict[float, str]:
+    """The difference of two methods in points, by demonstrations."""
+    return {row.demonstrations: points(row) for row in _differences(rows, method, other).itertuples()}
+
+
+def percent(row: pd.Series) -> str:
+    """A success rate with its interval."""
+    return f"{row.success_rate:.0%} {interval(row.low, row.high)}"
+
+
+def _worth(row: pd.Series, most: float) -> str:
+    needed, low, high = (f"{n:.0f}" if np.isfinite(n) else f"over {most:.0f}" for n in row[["needed", "low", "high"]])
+    return f"{needed} [{low}, {high}]"
 
 
 def _main(home: pd.DataFrame) -> str:
@@ -83,26 +116,6 @@ def _main(home: pd.DataFrame) -> str:
     return f"On a lab's own task, in its own place, the arm succeeds {'; '.join(said)}."
 
 
-def _others(home: pd.DataFrame) -> str:
-    """The federation minus a lab alone where the plan has no main comparison, whoever is ahead."""
-    found = _differences(home, FEDERATED, ALONE)
-    found = found[~found.demonstrations.isin(MAIN)]
-    said = [f"with {row.demonstrations:.0f}, {_gap(row)}" for _, row in found.iterrows()]
-    return f"With other numbers, against labs alone that trained until more steps no longer helped: {'; '.join(said)}."
-
-
-def _worth(home: pd.DataFrame) -> str:
-    found = worth(home, FEDERATED, ALONE, seed=0).set_index("demonstrations")
-    most = f"more than {home.demonstrations.max():.0f}"
-    said = []
-    for count in MAIN:
-        needed, low, high = (
-            f"{n:.0f}" if np.isfinite(n) else most for n in found.loc[count, ["needed", "low", "high"]]
-        )
-        said.append(f"with {count}, as well as a lab alone with {needed} [{low}, {high}]")
-    return f"What a federation is worth in demonstrations: a lab in it succeeds, {'; '.join(said)}."
-
-
 def _away(away: pd.DataFrame) -> str:
     found = _differences(away, FEDERATED, ALONE)
     said = [f"with {count}, {_gap(found.loc[f'demos-{count}'])}" for count in MAIN]
@@ -110,12 +123,13 @@ def _away(away: pd.DataFrame) -> str:
 
 
 def _pooled(home: pd.DataFrame) -> str:
-    """How far federated training falls behind pooled training, for each number of demonstrations."""
-    found = _differences(home, FEDERATED, POOLED)
-    behind = found[found.high < 0]
-    said = [f"{row.demonstrations:.0f}: {points(row)}" for row in found.itertuples()]
-    verdict = f"It is behind with {len(behind)} of {len(found)} numbers of demonstrations."
-    return f"The federation minus pooled training, by demonstrations a lab: {'; '.join(said)}. {verdict}"
+    """Where the federation falls behind."""
+    found = {other: _differences(home, FEDERATED, other) for other in (POOLED, ALONE)}
+    behind = {other: (table.high < 0).sum() for other, table in found.items()}
+    return (
+        f"The federation is behind pooled training with {behind[POOLED]} of {len(found[POOLED])} numbers of "
+        f"demonstrations, and behind labs alone with {behind[ALONE]} of {len(found[ALONE])}."
+    )
 
 
 def _paid(home: pd.DataFrame, labs: int) -> str:
