@@ -27,6 +27,7 @@ IN_WORDS = {
     ALONE: "a lab alone, with the number of steps that served it best", FEDERATED: "the federation",
     POOLED: "pooled training",
 }  # fmt: skip
+UNBROKEN = "\N{NO-BREAK SPACE}"
 BY = ["partition", "method", "demonstrations", "place"]
 
 
@@ -81,18 +82,19 @@ def gain(home: pd.DataFrame) -> str:
     rates = results.summary(home, BY).set_index(["method", "demonstrations"])
     alone, pooled = gaps(home, FEDERATED, ALONE), gaps(home, FEDERATED, POOLED)
     value = worth(home, FEDERATED, ALONE, seed=0).set_index("demonstrations")
-    head = ["demonstrations a lab", "alone", "federation", "minus alone", "minus pooled", "worth"]
+    head = ["demonstrations", "alone", "federation", "minus alone [points]", "minus pooled [points]", "worth"]
     lines = [
         [f"{count:.0f}", percent(rates.loc[(ALONE, count)]), percent(rates.loc[(FEDERATED, count)]),
          alone.get(count, ""), pooled.get(count, ""), _worth(value.loc[count], max(value.index))]
         for count in value.index
     ]  # fmt: skip
-    return status.table(head, lines)
+    return status.table(head, [[cell.replace(" ", UNBROKEN) for cell in line] for line in lines])
 
 
 def gaps(rows: pd.DataFrame, method: str, other: str) -> dict[float, str]:
-    """The difference of two methods in points, by demonstrations."""
-    return {row.demonstrations: points(row) for row in _differences(rows, method, other).itertuples()}
+    """The difference of two methods in whole points, by demonstrations."""
+    found = _differences(rows, method, other).itertuples()
+    return {row.demonstrations: f"{100 * row.difference:+.0f} {interval(row.low, row.high, '+.0f')}" for row in found}
 
 
 def percent(row: pd.Series) -> str:
