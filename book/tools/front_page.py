@@ -76,6 +76,8 @@ def headline(rows: pd.DataFrame) -> str:
 def gain(home: pd.DataFrame) -> str:
     """A table of success on a lab's own task, in its own place, by demonstrations, whoever is ahead.
 
+    The figure has the intervals of the rates; with them the table would be too wide for a page.
+
     Args:
         home: of `alone_at_best`, in a lab's own place.
     """
@@ -84,7 +86,7 @@ def gain(home: pd.DataFrame) -> str:
     value = worth(home, FEDERATED, ALONE, seed=0).set_index("demonstrations")
     head = ["demonstrations", "alone", "federation", "minus alone [points]", "minus pooled [points]", "worth"]
     lines = [
-        [f"{count:.0f}", percent(rates.loc[(ALONE, count)]), percent(rates.loc[(FEDERATED, count)]),
+        [f"{count:.0f}", *(f"{rates.success_rate[name, count]:.0%}" for name in (ALONE, FEDERATED)),
          alone.get(count, ""), pooled.get(count, ""), _worth(value.loc[count], max(value.index))]
         for count in value.index
     ]  # fmt: skip
