@@ -24,7 +24,7 @@ LONE, LONGER = "local-only-400", "local-only-800"  # the first is that of the pl
 ALONE, FEDERATED, POOLED = METHODS = ("local-only", "federated", "centralized")  # of `alone_at_best`
 MAIN = (4, 8)  # demonstrations a lab in the main comparison, as the plan says
 IN_WORDS = {
-    ALONE: "a lab alone, with the number of steps that served it best", FEDERATED: "the federation",
+    ALONE: "a lab alone, with the number of steps, of those measured, that served it best", FEDERATED: "the federation",
     POOLED: "pooled training",
 }  # fmt: skip
 UNBROKEN = "\N{NO-BREAK SPACE}"
@@ -99,11 +99,6 @@ def gaps(rows: pd.DataFrame, method: str, other: str) -> dict[float, str]:
     return {row.demonstrations: f"{100 * row.difference:+.0f} {interval(row.low, row.high, '+.0f')}" for row in found}
 
 
-def percent(row: pd.Series) -> str:
-    """A success rate with its interval."""
-    return f"{row.success_rate:.0%} {interval(row.low, row.high)}"
-
-
 def _worth(row: pd.Series, most: float) -> str:
     needed, low, high = (f"{n:.0f}" if np.isfinite(n) else f"over {most:.0f}" for n in row[["needed", "low", "high"]])
     return f"{needed} [{low}, {high}]"
@@ -144,7 +139,8 @@ def _paid(home: pd.DataFrame, labs: int) -> str:
         if federated[what] != pooled[what]:
             raise BookError(f"{FEDERATED} and {POOLED} differ in {what}, and the front page says that they are equal")
     return (
-        f"Counted while training: {federated.steps_in_a_row:,.0f} gradient steps in a row and {federated.samples:,.0f} "
+        f"Counted while training, with {MAIN[-1]} demonstrations: {federated.steps_in_a_row:,.0f} gradient steps in a "
+        f"row and {federated.samples:,.0f} "
         f"samples for the federation and for pooled training alike, and {federated.MB:,.0f} MB sent for the first, "
         f"{federated.MB / labs:,.1f} a lab. A lab alone took {lone.steps_in_a_row:,.0f} steps; "
         f"{spent.steps_in_a_row[LONGER]:,.0f} steps instead: {_gap(longer)}."

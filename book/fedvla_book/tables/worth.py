@@ -37,10 +37,11 @@ def demonstrations_to_match(counts: Sequence[int], rates: Sequence[float], wante
 
 
 def alone_at_best(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with one method of labs alone, `local-only`: those that trained until more steps no longer help.
+    """Return the rows with one method of labs alone, `local-only`: the number of steps that served them best.
 
-    For each number of demonstrations these are the labs alone whose number of steps gave the most successes on their
-    own task and place; the other rows of labs alone are left out. To choose the best favours labs alone a little.
+    For each number of demonstrations these are the labs alone that succeeded most on their own task and place, of the
+    numbers of steps measured with it; more might help still where that is the largest. The other rows of labs alone are
+    left out. To choose the best favours labs alone a little.
 
     Args:
         rows: of `results.read_results`.
