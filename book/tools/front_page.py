@@ -125,9 +125,15 @@ def _pooled(home: pd.DataFrame) -> str:
     """Where the federation falls behind."""
     found = {other: _differences(home, FEDERATED, other) for other in (POOLED, ALONE)}
     behind = {other: (table.high < 0).sum() for other, table in found.items()}
+    taken = results.summary(home, BY).pivot(index="demonstrations", columns="method", values="steps_in_a_row")
+    longer = [
+        f"{row[ALONE]:,.0f} against {row[FEDERATED]:,.0f} with {count:.0f} demonstrations"
+        for count, row in taken.iterrows() if row[ALONE] > row[FEDERATED]
+    ]  # fmt: skip
     return (
         f"The federation is behind pooled training with {behind[POOLED]} of {len(found[POOLED])} numbers of "
         f"demonstrations, and behind labs alone with {behind[ALONE]} of {len(found[ALONE])}."
+        + (f" Labs alone took more steps in a row than the federation: {'; '.join(longer)}." if longer else "")
     )
 
 
