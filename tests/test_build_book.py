@@ -379,6 +379,17 @@ def test_the_front_page_says_where_federation_stays_behind_pooled_training(ten_l
 
 
 @pytest.mark.unit
+def test_the_front_page_says_where_labs_alone_took_more_steps_in_a_row(ten_labs):
+    words = "Labs alone took more steps in a row than the federation"
+    twice = ten_labs.assign(steps_in_a_row=ten_labs.steps_in_a_row.where(ten_labs.kind != "local-only", 1600))
+    steps = ten_labs[ten_labs.kind == "federated"].groupby("demonstrations").steps_in_a_row.first()
+    wanted = "; ".join(f"1,600 against {taken:,.0f} with {count:.0f} demonstrations" for count, taken in steps.items())
+    assert f"{words}: {wanted}." in front_page.headline(twice)
+    few = ten_labs.assign(steps_in_a_row=ten_labs.steps_in_a_row.where(ten_labs.kind != "local-only", 1))
+    assert words not in front_page.headline(few)
+
+
+@pytest.mark.unit
 def test_the_front_page_draws_a_line_for_each_method(ten_labs, monkeypatch):
     drawn, draw = [], front_page.plots.success_by_demonstrations
     keep = lambda *of, **how: drawn.append(draw(*of, **how)) or drawn[-1]  # noqa: E731

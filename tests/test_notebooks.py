@@ -156,7 +156,7 @@ def test_a_failure_and_a_reference_are_read_below(path):
             assert any(later.cell_type == "markdown" for later in everything[place + 1 : place + 4]), cell.id
         if has_tag("reference")(cell):
             near = "\n".join(one.source for one in everything[max(0, place - 2) : place + 3])
-            assert "../book/reference" in "\n".join(one.source for one in cells(path)), cell.id
+            assert "../book/reference/" in "\n".join(one.source for one in cells(path)), cell.id
             assert re.search(r"interval|low", near), f"{cell.id}: no interval near the reference result"
 
 

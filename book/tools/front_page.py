@@ -146,10 +146,9 @@ def _paid(home: pd.DataFrame, labs: int) -> str:
             raise BookError(f"{FEDERATED} and {POOLED} differ in {what}, and the front page says that they are equal")
     return (
         f"Counted while training, with {MAIN[-1]} demonstrations: {federated.steps_in_a_row:,.0f} gradient steps in a "
-        f"row and {federated.samples:,.0f} "
-        f"samples for the federation and for pooled training alike, and {federated.MB:,.0f} MB sent for the first, "
-        f"{federated.MB / labs:,.1f} a lab. A lab alone took {lone.steps_in_a_row:,.0f} steps; "
-        f"{spent.steps_in_a_row[LONGER]:,.0f} steps instead: {_gap(longer)}."
+        f"row and {federated.samples:,.0f} samples for the federation and for pooled training alike, and "
+        f"{federated.MB:,.0f} MB sent for the first, {federated.MB / labs:,.1f} a lab. "
+        f"A lab alone took {lone.steps_in_a_row:,.0f} steps; {spent.steps_in_a_row[LONGER]:,.0f} steps instead: {_gap(longer)}."
     )
 
 
