@@ -148,7 +148,8 @@ def _paid(home: pd.DataFrame, labs: int) -> str:
         f"Counted while training, with {MAIN[-1]} demonstrations: {federated.steps_in_a_row:,.0f} gradient steps in a "
         f"row and {federated.samples:,.0f} samples for the federation and for pooled training alike, and "
         f"{federated.MB:,.0f} MB sent for the first, {federated.MB / labs:,.1f} a lab. "
-        f"A lab alone took {lone.steps_in_a_row:,.0f} steps; {spent.steps_in_a_row[LONGER]:,.0f} steps instead: {_gap(longer)}."
+        f"A lab alone took {lone.steps_in_a_row:,.0f} steps; {spent.steps_in_a_row[LONGER]:,.0f} steps instead: "
+        f"{_gap(longer)}."
     )
 
 
