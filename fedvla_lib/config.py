@@ -22,7 +22,7 @@ class Config:
     num_labs: int = 1  # labs that record demonstrations; each has its cameras, light, colours, calibration, operator
     one_task_per_lab: bool = False  # lab k records only task k, counted modulo the number of tasks
     val_fraction: float = 0.1  # fraction of each task's episodes held out for validation
-    normalisation: str = "pooled"  # joint statistics: pooled, or one of three deliberate mistakes: own, held-out, none
+    normalisation: str = "pooled"  # joint statistics: pooled, base (saved with it), or a mistake: own, held-out, none
     augment: bool = False  # augment training images; if off, the prefix of a frozen model is cached for each frame
     # federation
     num_clients: int = 10  # clients that the episodes are partitioned over
@@ -38,6 +38,13 @@ class Config:
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
     server_momentum: float = 0.5  # fedavgm, diloco: server momentum m; constant updates are scaled by 1 / (1 - m)
     clip_norm: float = 0.0  # maximum L2 norm of a client's update; 0 does not clip
+    clip_quantile: float = 0.0  # adapt clip_norm so that this share of the clients is not clipped; 0 keeps it
+    noise: float = 0.0  # standard deviation of the noise on the sum of updates, in units of clip_norm; 0 adds none
+    noise_by: str = "server"  # who adds the noise: server, client (each all of it) or together (each a part)
+    secret_noise: bool = False  # take the noise from the system's entropy and not from the seed, which others may know
+    epsilon_budget: float = 0.0  # highest epsilon of a run, see federation/accountant.py; 0 sets no limit
+    delta: float = 0.0  # probability that goes with epsilon; 0 uses num_clients^-1.1
+    secure_aggregation: bool = False  # the server learns only the sum of the updates
     num_malicious: int = 1  # krum: Byzantine clients tolerated per round
     personal: str = ""  # model parts that stay on each client, comma separated: projections, expert layer N
     exchange: str = "float32"  # format of exchanged weights: float32, float16, or int8 (float16 from server to clients)
@@ -89,7 +96,8 @@ PROFILES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
-NORMALISATIONS = ("pooled", "own", "held-out", "none")
+NORMALISATIONS = ("pooled", "base", "own", "held-out", "none")
+NOISE_BY = ("server", "client", "together")
 EXCHANGES = ("float32", "float16", "int8")
 STRATEGIES = (
     "fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "diloco", "fedexp", "fedmedian", "krum", "scaffold",
@@ -148,16 +156,16 @@ def check(config: Config) -> Config:
         _require(getattr(config, name) > 0, config, name, "a number above 0")
     non_negative = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
-        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious", "alone_steps",
+        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious", "alone_steps", "noise", "epsilon_budget",
     )  # fmt: skip
     for name in non_negative:
         _require(getattr(config, name) >= 0, config, name, "0 or more")
-    for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum"):
+    for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum", "clip_quantile", "delta"):
         _require(0 <= getattr(config, name) <= 1, config, name, "a number from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a number above 0")
     choices = {
         "partition": PARTITIONS, "normalisation": NORMALISATIONS, "strategy": STRATEGIES, "exchange": EXCHANGES,
-        "sampling": SAMPLINGS, "local_optimizer": LOCAL_OPTIMIZERS,
+        "sampling": SAMPLINGS, "local_optimizer": LOCAL_OPTIMIZERS, "noise_by": NOISE_BY,
     }  # fmt: skip
     for name, valid in choices.items():
         _require(getattr(config, name) in valid, config, name, f"one of {', '.join(valid)}")
@@ -167,8 +175,38 @@ def check(config: Config) -> Config:
     _require(whole, config, "num_labs", "a multiple of the number of tasks if each lab has one task")
     apart = not config.personal or not config.local_optimizer.startswith("adamw-")
     _require(apart, config, "local_optimizer", "adamw or sgd for a model with personal parts")
-    _require(bool(task_names(config)), config, "tasks", "a comma separated list of tasks")
+    _require(bool(task_names(config)), config, "tasks", "task names separated by commas")
+    _check_privacy(config)
     return config
+
+
+def _check_privacy(config: Config) -> None:
+    """Raise ValueError for settings under which noise or secure aggregation would not keep what they promise."""
+    hidden = config.secure_aggregation or (config.noise > 0 and config.noise_by != "server")
+    if not (config.noise or config.secure_aggregation or config.clip_quantile):
+        return
+    _require(config.clip_norm > 0, config, "clip_norm", "the norm to clip to: noise and secure aggregation need one")
+    _require(not config.clip_quantile or not hidden, config, "clip_quantile", "0 if the server sees no update's norm")
+    apart = config.noise_by != "together" or config.secure_aggregation
+    _require(apart, config, "noise_by", "server or client; together needs secure-aggregation")
+    if not (config.noise or config.secure_aggregation):
+        return
+    sent = config.normalisation in ("base", "none")
+    _require(sent, config, "normalisation", "base or none: the clients' statistics would be released without noise")
+    mixes = hidden and not config.secure_aggregation or config.strategy not in ("fedexp", "fedmedian", "krum")
+    _require(mixes, config, "strategy", "one that needs the mean only: fedexp, fedmedian and krum look at each update")
+    _require(config.num_clients > 1, config, "num_clients", "2 or more: one client has nobody to hide among")
+    _require(config.delta < 1, config, "delta", "a number below 1")
+    secret = config.secret_noise or not config.epsilon_budget
+    _require(secret, config, "secret_noise", "True with an epsilon-budget: noise from a known seed protects nobody")
+    if not hidden:
+        return
+    _require(config.fraction_evaluate == 0, config, "fraction_evaluate", "0: clients' results would tell of their data")
+    _require(config.sampling == "uniform", config, "sampling", "uniform: clients do not announce their tasks")
+    if config.secure_aggregation:
+        _require(config.exchange == "float32", config, "exchange", "float32: masked numbers have a format of their own")
+        clients = max(1, round(config.fraction_train * config.num_clients))
+        _require(clients >= 3, config, "fraction_train", "a share of 3 clients or more: fewer cannot hide")
 
 
 def _require(ok: bool, config: Config, name: str, valid: str) -> None:

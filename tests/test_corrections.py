@@ -10,7 +10,7 @@ from fedvla_lib.config import Config
 from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid, claim_identity
 from fedvla_lib.federation import messages
 from fedvla_lib.federation.checkpoint import flat, nested
-from fedvla_lib.federation.client_app import attach_control_variates, correction_for
+from fedvla_lib.federation.client_app import control_variates, correction_for
 from fedvla_lib.federation.nodes import Roster
 from fedvla_lib.federation.strategies import build
 from fedvla_lib.federation.strategies.fedprox import Proximal
@@ -58,7 +58,8 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
         reply = RecordDict(
             {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: metrics, messages.NOTE: note}
         )
-        attach_control_variates(reply, correction, context)
+        for record, change in control_variates(correction, context).items():
+            messages.attach(reply, messages.NOTE, record, change)
         return Message(reply, reply_to=message)
 
     return app

@@ -25,6 +25,7 @@ from fedvla_lib.federation import checkpoint, server_app
 from fedvla_lib.federation.checkpoint import Checkpoint
 
 MAIN = "import sys; from fedvla_lib.cli.main import main; sys.exit(main())"
+NOISED = {"normalisation": "base", "clip_norm": 0.05, "clip_quantile": 0.3, "noise": 0.1}
 KEEPING = {"strategy": "scaffold", "keep_optimizer": True, "exchange": "int8", "personal": "projections"}
 
 
@@ -121,8 +122,9 @@ def assert_same_bits(left, right):
         (KEEPING, start_and_kill),
         ({"strategy": "fedavgm"}, start_and_interrupt),
         ({"strategy": "fedadam"}, start_kill_and_damage),
+        (NOISED, start_and_kill),
     ],
-    ids=["full disk", "killed", "interrupted", "damaged"],
+    ids=["full disk", "killed", "interrupted", "damaged", "killed with adaptive clipping and noise"],
 )
 def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end, caplog):
     config = replace(tiny, **settings)

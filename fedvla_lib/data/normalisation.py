@@ -40,8 +40,15 @@ def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
     return stats | {"count": np.array([len(values)])}
 
 
+def asks_clients(config: Config) -> bool:
+    """Return whether clients send statistics of their data."""
+    return config.normalisation not in ("base", "none")
+
+
 def common_statistics(config: Config, pooled: Stats) -> Stats:
-    """Return the statistics sent to all clients: the pooled ones, or mean 0 and std 1 if normalisation is off."""
+    """Return the statistics sent to all clients: the pooled ones, mean 0 and std 1, or {} for those of the base."""
+    if config.normalisation == "base":
+        return {}
     identity = {"mean": np.zeros(NUM_JOINTS), "std": np.ones(NUM_JOINTS)}
     return {STATE_KEY: identity, ACTION_KEY: identity} if config.normalisation == "none" else pooled
 

@@ -3,9 +3,11 @@
 Exceptions are not caught here: Flower turns them into error replies, which the server rejects with client and reason.
 """
 
+import logging
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from flwr.clientapp.typing import Mod
 from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import measure
-from fedvla_lib.federation import messages
+from fedvla_lib.federation import accountant, messages, privacy, secure_round
 from fedvla_lib.federation.client import LOADERS, WORKER_LOADERS, Client, Loaders, open_client
 from fedvla_lib.federation.quantisation import DOWNWARD, with_feedback
 from fedvla_lib.federation.strategies.fedprox import Proximal
@@ -26,10 +28,12 @@ from fedvla_lib.policy.model import Bundle
 from fedvla_lib.policy.parameters import Arrays, digest, load_arrays, shapes_of, trainable_arrays
 from fedvla_lib.policy.training import Correction, Parameters
 
+logger = logging.getLogger(__name__)
 # Keys of what a client keeps in its state between rounds, beside SCAFFOLD's control variate.
 MOMENTS = "moments"  # optimiser state
 PERSONAL = "own"  # personal parts of the model
 LEFT_OVER = "left-over"  # rounding error of its updates so far
+PRIVACY = "privacy"  # its releases so far
 ALL_RECORDS = (messages.ARRAYS, *messages.EXTRA)  # of arrays, in a message for training
 
 
@@ -44,15 +48,21 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
     @app.query()
     def query(message: Message, context: Context) -> Message:
         client = _client(context, loaders)
-        known = {"partition_id": client.partition_id, "num_examples": client.num_examples, "tasks": client.tasks}
-        note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()))
+        known = {"partition_id": client.partition_id, "num_examples": _weight(client)}
+        known["tasks"] = [] if privacy.hides_updates(client.config) else client.tasks
+        asked = normalisation.asks_clients(client.config)
+        note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()) if asked else "")
         return Message(RecordDict({messages.NOTE: note}), reply_to=message)
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
         client = _client(context, loaders)
-        bundle = _policy(client, message, loaders, context)
-        return Message(_trained(client, bundle, message, context), reply_to=message)
+        with _reasons_kept(client.config):
+            bundle = _policy(client, message, loaders, context)
+            return Message(_trained(client, bundle, message, context), reply_to=message)
+
+    for name, handler in secure_round.HANDLERS.items():
+        app.train(name)(handler)
 
     @app.evaluate()
     def evaluate(message: Message, context: Context) -> Message:
@@ -66,23 +76,28 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:
     """Train for one round, save the client's state, and return the content of the reply."""
     exchange, keeps_moments = client.config.exchange, client.config.keep_optimizer
-    start = {} if exchange == "float32" else bundle.shared_arrays()  # only needed to send an update
+    hides = privacy.hides_updates(client.config)
+    start = bundle.shared_arrays() if hides or exchange != "float32" else {}  # only needed to send an update
     correction = correction_for(message, context, bundle.shared())
     moments = _load_state(context, MOMENTS) if keeps_moments else None
     round_number, second = message.content[messages.CONFIG][messages.ROUND], _sent_second_moments(message, bundle)
     result = client.train(bundle, round_number, correction, moments, second)
-    arrays = _outgoing(bundle.shared_arrays(), start, exchange, context)
-    metrics = {
-        messages.EXAMPLES: result.num_examples, messages.STEPS: result.steps,
-        "loss": sum(result.losses) / len(result.losses), "seconds": result.seconds,
-    }  # fmt: skip
-    content = RecordDict({
-        messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: MetricRecord(metrics),
-        messages.NOTE: messages.make_note(sha256=digest(arrays)),
-    })  # fmt: skip
-    attach_control_variates(content, correction, context)
+    arrays, extra = bundle.shared_arrays(), control_variates(correction, context)
     if result.second_moments:
-        messages.attach(content, messages.NOTE, messages.SECOND_MOMENTS, result.second_moments)
+        extra[messages.SECOND_MOMENTS] = result.second_moments
+    if hides:
+        arrays, extra = _hidden(arrays, start, extra, client, message, context)
+    metrics = {
+        messages.EXAMPLES: _weight(client), messages.STEPS: result.steps, "seconds": result.seconds,
+        "loss": sum(result.losses) / len(result.losses),
+    }  # fmt: skip
+    arrays = _outgoing(arrays, start, exchange, context)
+    content = RecordDict({
+        messages.ARRAYS: messages.pack_arrays(arrays), messages.NOTE: messages.make_note(sha256=digest(arrays)),
+        messages.METRICS: MetricRecord({name: metrics[name] for name in messages.train_metrics(hides)}),
+    })  # fmt: skip
+    for record, values in extra.items():
+        messages.attach(content, messages.NOTE, record, values)
     if keeps_moments:
         context.state[MOMENTS] = messages.pack_arrays(result.moments)
     if bundle.own:
@@ -163,12 +178,53 @@ def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) ->
     return encoded
 
 
-def attach_control_variates(reply: RecordDict, correction: Correction | None, context: Context) -> None:
-    """Add SCAFFOLD's control variate to a training reply, and save the new one in the client's state."""
-    if isinstance(correction, ControlVariates):
-        change = correction.change()
-        messages.attach(reply, messages.NOTE, messages.CONTROL, change)
-        context.state[messages.CONTROL] = messages.pack_arrays(correction.updated())
+def _hidden(
+    arrays: Arrays, start: Arrays, extra: privacy.Payload, client: Client, message: Message, context: Context
+) -> tuple[Arrays, privacy.Payload]:
+    """Return weights and extra records as the server may see them: clipped, and noised or masked."""
+    config, round_number = client.config, message.content[messages.CONFIG][messages.ROUND]
+    payload = {messages.ARRAYS: {name: array - start[name] for name, array in arrays.items()}, **extra}
+    _spend(client, context, sum(array.size for arrays in payload.values() for array in arrays.values()))
+    payload = privacy.from_client(payload, config, round_number, client.partition_id)
+    if config.secure_aggregation:
+        return secure_round.masked_update(payload, message, context, config), {}
+    changes = payload.pop(messages.ARRAYS)
+    return {name: start[name] + change for name, change in changes.items()}, payload
+
+
+def _spend(client: Client, context: Context, size: int) -> None:
+    """Count a release of this client's, which does not trust the server's count; raise ValueError over budget."""
+    config, releases = client.config, 1 + int(_load_state(context, PRIVACY).get("releases", 0))
+    if privacy.is_private(config) and config.epsilon_budget and config.noise_by != "server":
+        if (spent := accountant.epsilon(config, releases, size)) > config.epsilon_budget:
+            raise ValueError(f"this client's release {releases} would make epsilon {spent:.3g}: its budget is spent")
+    context.state[PRIVACY] = messages.pack_arrays({"releases": np.array(releases)})
+
+
+@contextmanager
+def _reasons_kept(config: Config) -> Iterator[None]:
+    """Keep the text of an error, which may tell of the data, from a server that must not see updates either."""
+    try:
+        yield
+    except Exception:
+        if not privacy.hides_updates(config):
+            raise
+        logger.exception("this client's training failed")
+        raise RuntimeError("this client failed; the reason is in its own log") from None
+
+
+def _weight(client: Client) -> int:
+    """A client's weight in the average: its frames, or 1 if all count alike."""
+    return 1 if privacy.weighs_alike(client.config) else client.num_examples
+
+
+def control_variates(correction: Correction | None, context: Context) -> dict[str, Arrays]:
+    """Return the change of SCAFFOLD's control variate as a record, and save the new one in the client's state."""
+    if not isinstance(correction, ControlVariates):
+        return {}
+    change = correction.change()
+    context.state[messages.CONTROL] = messages.pack_arrays(correction.updated())
+    return {messages.CONTROL: change}
 
 
 def _load_state(context: Context, what: str) -> Arrays:

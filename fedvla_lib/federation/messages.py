@@ -39,8 +39,13 @@ ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # short en
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 # Exactly the numbers of a reply: Flower only averages records with equal keys.
-TRAIN_METRICS = (EXAMPLES, STEPS, "loss", "seconds")
+TRAIN_METRICS = (EXAMPLES, STEPS, "seconds", "loss")
 EVALUATE_METRICS = (EXAMPLES, "loss", "action_error", "action_accuracy", *(f"action_error.{j}" for j in JOINT_NAMES))
+
+
+def train_metrics(hides_updates: bool) -> tuple[str, ...]:
+    """Return the numbers of a training reply; a client that hides its update keeps its loss for itself."""
+    return TRAIN_METRICS[:-1] if hides_updates else TRAIN_METRICS
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray]) -> ArrayRecord:
@@ -103,7 +108,9 @@ def checked_arrays(
         return arrays
     check_encoded(arrays, shapes, exchange)
     check_digest(arrays, announced)
-    return decode(arrays, exchange)
+    arrays = decode(arrays, exchange)
+    check_arrays(arrays, shapes)  # finite steps of a finite scale can be infinite
+    return arrays
 
 
 def count_bytes(content: RecordDict) -> int:

@@ -37,6 +37,8 @@ class Roster:
     examples_of: dict[int, int] = field(default_factory=dict)  # training frames
     stats_of: dict[int, Stats] = field(default_factory=dict)
     tasks_of: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    needs_stats: bool = True  # else statistics that a client sends are not looked at
+    most_frames: int = MOST_FRAMES  # 1 if all clients count alike
 
     @property
     def nodes(self) -> list[int]:
@@ -73,14 +75,15 @@ class Roster:
         taken = self.partition_of.values()
         if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
             raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
-        if type(num_examples) is not int or not 0 < num_examples <= MOST_FRAMES:
+        if type(num_examples) is not int or not 0 < num_examples <= self.most_frames:
             text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
-            raise ParameterError("examples", f"{text} and at most {MOST_FRAMES}")
+            raise ParameterError("examples", f"{text} and at most {self.most_frames}")
         tasks = note.get("tasks")
         if not isinstance(tasks, list) or not all(isinstance(task, str) and len(task) < LONGEST for task in tasks):
             raise ParameterError("tasks", f"{client_name(partition_id)}: tasks={str(tasks)[:LONGEST]}: expected texts")
         try:
-            self.stats_of[node] = _statistics(note.get("stats"), num_examples)
+            if self.needs_stats:
+                self.stats_of[node] = _statistics(note.get("stats"), num_examples)
         except ParameterError as error:
             raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
         self.partition_of[node], self.examples_of[node] = partition_id, num_examples
@@ -110,10 +113,13 @@ def wait_for_nodes(grid: Grid, num_clients: int, timeout_s: float) -> list[int]:
     return nodes
 
 
-def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: float) -> Roster:
-    """Ask every node for its partition, frame count and statistics; report and skip nodes whose reply is invalid."""
+def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: float, **asked: Any) -> Roster:
+    """Ask every node for its partition, frame count and statistics; report and skip nodes whose reply is invalid.
+
+    `asked` are passed to `Roster`.
+    """
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
-    roster = Roster({})
+    roster = Roster({}, **asked)
     for reply in sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id):
         try:
             roster.add(reply)

@@ -16,10 +16,12 @@ from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.data import frame_store, normalisation
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds
-from fedvla_lib.federation import checkpoint, messages
+from fedvla_lib.federation import checkpoint, messages, privacy
+from fedvla_lib.federation.accountant import open_ledger
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.client import LOADERS, Loaders
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
+from fedvla_lib.federation.secure_round import SecureGrid
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
 from fedvla_lib.federation.throttled_grid import for_runtime
@@ -74,7 +76,8 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster = _introduce(grid, config, run)
-    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
+    asked = normalisation.asks_clients(config)
+    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes]) if asked else {}
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
@@ -84,6 +87,10 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
         config, roster=roster, shapes=shapes_of(arrays), report=run.log,
         keep_rollouts=partial(_keep_rollouts, run), rounds_done=done,
     )  # fmt: skip
+    if privacy.is_private(config):
+        strategy.ledger = open_ledger(config, run.root, strategy.size, len(roster.nodes))
+    if config.secure_aggregation:
+        grid = SecureGrid(grid, config, shapes_of(arrays), strategy.records, run.log)
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
     packed = normalisation.pack_stats(stats)
@@ -153,6 +160,7 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     keeps_state = {
         f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
         f"exchange={config.exchange}": config.exchange != "float32", "personal": config.personal,
+        f"noise-by={config.noise_by}": config.noise > 0 and config.noise_by != "server",
     }  # fmt: skip
     settings = [setting for setting, kept in keeps_state.items() if kept]
     if settings and not states:
@@ -170,7 +178,10 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
 def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
     """Ask clients for partition, frame count and statistics; none of their other data leaves them."""
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s)
+    asked = {"needs_stats": normalisation.asks_clients(config)}
+    if privacy.weighs_alike(config):
+        asked["most_frames"] = 1
+    roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s, **asked)
     if len(roster.nodes) < config.min_replies:
         raise TooFewReplies(
             f"{len(roster.nodes)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "

@@ -70,12 +70,12 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     """Return the policy `config.base` in evaluation mode, with parameters frozen according to `config`.
 
     Args:
-        stats: normalisation statistics of state and action. None: use those saved with the base.
+        stats: normalisation statistics of state and action. None or {}: use those saved with the base.
 
     Raises:
         ValueError: the base cannot be found or lacks weights, or there are no statistics.
     """
-    if stats is None and config.base == NANO_RANDOM:
+    if not stats and config.base == NANO_RANDOM:
         raise ValueError(f"base={NANO_RANDOM!r} has no statistics of its own: give those of the training episodes")
     source = str(nano_base()) if config.base == NANO else config.base
     policy = _random_nano(config) if source == NANO_RANDOM else _pretrained(config, source)
@@ -202,7 +202,7 @@ def _adapt(settings: SmolVLAConfig, config: Config) -> None:
 
 
 def _processors(policy: SmolVLAPolicy, stats: Stats | None, base: str) -> tuple[Any, Any]:
-    if stats is not None:
+    if stats:
         return make_pre_post_processors(policy.config, dataset_stats=_as_tensors(stats))
     overrides = {
         "device_processor": {"device": str(policy.config.device)},

@@ -17,7 +17,8 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, Met
 from flwr.serverapp import Grid
 
 from fedvla_lib.config import Config
-from fedvla_lib.federation import messages
+from fedvla_lib.federation import messages, privacy
+from fedvla_lib.federation.accountant import Ledger
 from fedvla_lib.federation.drift import geometry
 from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
@@ -26,7 +27,7 @@ from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
 
 logger = logging.getLogger(__name__)
-PERSISTENT = ("momentum_vector", "m_t", "v_t", *messages.EXTRA)  # attributes of strategies that persist between rounds
+PERSISTENT = ("momentum_vector", "m_t", "v_t", "limits", *messages.EXTRA)  # attributes that persist between rounds
 
 
 class Checked:
@@ -42,6 +43,7 @@ class Checked:
         **flower: passed on to the Flower strategy.
     """
 
+    ledger: Ledger | None = None  # of what a run with noise has spent
     _extra_records: tuple[str, ...] = ()  # attributes with arrays that travel beside the model's, both ways in training
 
     def __init__(
@@ -54,7 +56,10 @@ class Checked:
         if config.local_optimizer in SHARING:
             self.second_moments: Arrays = {}
             self._extra_records += (messages.SECOND_MOMENTS,)
+        if config.clip_quantile:
+            self.limits: Arrays = {"clip_norm": np.array(config.clip_norm)}
         self._sampled: list[int] = []
+        self._spent: dict[str, float] = {}  # what the ledger says of a round whose updates are released to the server
         self._sent_bytes = 0
         self._global: Arrays = {}
         self._arrived: dict[int, Arrays] = {}  # in training replies, decoded, by node
@@ -65,6 +70,7 @@ class Checked:
         """Sample clients and address the global arrays, with their SHA-256, to each."""
         self._global = messages.unpack_arrays(arrays)
         sampled = self._sample(self.config.fraction_train, server_round, 0)
+        self._spent = self.ledger.spend() if self.ledger and privacy.hides_updates(self.config) else {}
         return super().configure_train(server_round + self.rounds_done, arrays, config, sampled)
 
     def configure_evaluate(
@@ -89,9 +95,10 @@ class Checked:
             )
         for reply in valid if self.config.exchange != "float32" else []:
             self._restore(reply)
-        self._before_aggregation(server_round, valid)
-        for reply in valid if self.config.clip_norm else []:
-            self._clip(reply)
+        self._report_drift(server_round, valid)
+        if self.config.clip_norm or self.ledger:
+            self._protect(server_round, valid)
+        self._before_aggregation(valid)
         arrays, metrics = super().aggregate_train(server_round, valid)
         # Flower's adaptive strategies compute in float64.
         return ArrayRecord({n: Array(np.asarray(a.numpy(), np.float32)) for n, a in arrays.items()}), metrics
@@ -105,6 +112,16 @@ class Checked:
             self.keep_rollouts(server_round, name, messages.unpack_rollouts(reply.content))
         measured = [reply for reply in valid if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
+
+    @property
+    def records(self) -> tuple[str, ...]:
+        """Names of the records of arrays that a client sends after training."""
+        return (messages.ARRAYS, *self._extra_records)
+
+    @property
+    def size(self) -> int:
+        """How many numbers a client sends."""
+        return len(self.records) * sum(math.prod(shape) for shape in self.shapes.values())
 
     def state(self) -> dict[str, Arrays]:
         """Return the strategy's state beside the global arrays: by attribute, then by name."""
@@ -137,25 +154,55 @@ class Checked:
         self._arrived[node] = {name: self._global[name] + change for name, change in self._arrived[node].items()}
         reply.content[messages.ARRAYS] = messages.pack_arrays(self._arrived[node])
 
-    def _clip(self, reply: Message) -> None:
-        """Scale a client's update down to the L2 norm `clip_norm`."""
-        arrays = messages.unpack_arrays(reply.content[messages.ARRAYS])
-        update = {name: array - self._global[name] for name, array in arrays.items()}
-        norm = math.sqrt(sum(float(np.square(array, dtype=np.float64).sum()) for array in update.values()))
-        if norm > self.config.clip_norm:
-            scale = np.float32(self.config.clip_norm / norm)
-            clipped = {name: self._global[name] + scale * array for name, array in update.items()}
-            reply.content[messages.ARRAYS] = messages.pack_arrays(clipped)
+    def _protect(self, server_round: int, valid: list[Message]) -> None:
+        """Clip what each client sent, unless it did so itself; with noise, put one noised mean in place of them all.
 
-    def _before_aggregation(self, server_round: int, valid: list[Message]) -> None:
-        """Combine and remove the extra records, and report the client drift, of the valid training replies."""
+        A strategy that then averages the replies, weights being equal, gets that mean, whatever it makes of it.
+        """
+        config, limit = self.config, float(getattr(self, "limits", {}).get("clip_norm", self.config.clip_norm))
+        spent = self.ledger.spend() if self.ledger and not privacy.hides_updates(config) else self._spent
+        values = {"clip_norm": limit} | spent
+        sent = protected = [self._payload(reply) for reply in valid]
+        if not privacy.hides_updates(config):
+            norms = [privacy.norm(payload) for payload in sent]
+            values["clipped"] = sum(norm > limit for norm in norms)
+            protected = [privacy.clipped(payload, limit) for payload in sent]
+            if config.clip_quantile:
+                rng = privacy.source(config, server_round, privacy.COUNT_NOISE)
+                self.limits = {"clip_norm": np.array(privacy.adapted(limit, norms, config, rng))}
+        if privacy.is_private(config) and config.noise_by == "server":
+            rng = privacy.source(config, server_round, privacy.SERVER_NOISE)
+            noise = privacy.noise_beside_count(config.noise, len(valid)) if config.clip_quantile else config.noise
+            protected = [privacy.noised_mean(protected, noise * limit, rng)] * len(valid)
+        for reply, before, payload in zip(valid, sent, protected, strict=True):
+            if payload is not before:
+                self._replace(reply, payload)
+        self.report(server_round, GLOBAL, "privacy", values)
+
+    def _payload(self, reply: Message) -> privacy.Payload:
+        """Return what a client contributes: the change of the weights, and the extra records."""
+        together = self.records if privacy.weighs_alike(self.config) else (messages.ARRAYS,)
+        content = {name: messages.unpack_arrays(reply.content[name]) for name in together}
+        changes = {name: array - self._global[name] for name, array in content[messages.ARRAYS].items()}
+        return content | {messages.ARRAYS: changes}
+
+    def _replace(self, reply: Message, payload: privacy.Payload) -> None:
+        ends = {name: self._global[name] + change for name, change in payload[messages.ARRAYS].items()}
+        for record, arrays in (payload | {messages.ARRAYS: ends}).items():
+            reply.content[record] = messages.pack_arrays(arrays)
+
+    def _report_drift(self, server_round: int, valid: list[Message]) -> None:
+        """Report how far the clients' weights are apart, unless only their mean is known."""
+        nodes = [reply.metadata.src_node_id for reply in valid]
+        ends = {self.roster.name(node): self._arrived.pop(node) for node in nodes}
+        for who, values in geometry(self._global, ends).items() if not self.config.secure_aggregation else ():
+            self.report(server_round, who, "drift", values)
+
+    def _before_aggregation(self, valid: list[Message]) -> None:
+        """Combine and remove the extra records of the valid training replies."""
         for name in self._extra_records if valid else ():
             arrived = {reply.metadata.src_node_id: messages.unpack_arrays(reply.content.pop(name)) for reply in valid}
             setattr(self, name, self._combined(name, arrived))
-        nodes = [reply.metadata.src_node_id for reply in valid]
-        ends = {self.roster.name(node): self._arrived.pop(node) for node in nodes}
-        for who, values in geometry(self._global, ends).items():
-            self.report(server_round, who, "drift", values)
 
     def _combined(self, record: str, arrived: dict[int, Arrays]) -> Arrays:
         """Return the new arrays of an extra record: the mean of the clients', weighted by training frames."""
@@ -165,7 +212,7 @@ class Checked:
 
     def _sample(self, share: float, server_round: int, purpose: int) -> SimpleNamespace:
         """Sample clients, and return a stand-in for the grid that lists only them."""
-        rng = np.random.default_rng([self.config.seed, server_round + self.rounds_done, purpose])
+        rng = privacy.source(self.config, server_round + self.rounds_done, purpose)
         self._sampled = self.roster.sample(share, rng, by_task=self.config.sampling == "by-task")
         return SimpleNamespace(get_node_ids=lambda: self._sampled)
 
@@ -197,7 +244,7 @@ class Checked:
         return valid
 
     def _check_train(self, reply: Message) -> None:
-        _check_metrics(reply, messages.TRAIN_METRICS)
+        _check_metrics(reply, messages.train_metrics(privacy.hides_updates(self.config)))
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{messages.EXAMPLES}=0: a client without training frames has no weight")
         steps = reply.content.metric_records[messages.METRICS][messages.STEPS]
