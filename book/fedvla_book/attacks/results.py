@@ -1,0 +1,116 @@
+"""The stored attacks (``book/tools/attack_study.py``) as tables, and one sentence."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from statsmodels.stats.proportion import proportion_confint
+
+from fedvla_book.attacks import membership
+from fedvla_book.sentences import interval
+
+LOWEST = 1e-3  # where the axis shows the noise 0
+CHANCE = {"task": 0.5, "place": 0.1, "member": 0.5}
+
+
+def read(folder: Path) -> pd.DataFrame:
+    """Return the rows of all training seeds; raise ValueError if there are none."""
+    files = sorted(folder.glob("seed_*.json"))
+    if not files:
+        raise ValueError(f"{folder} has no attacks: run book/tools/attack_study.py")
+    return pd.DataFrame([row for file in files for row in json.loads(file.read_text())["rows"]])
+
+
+def by_noise(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFrame:
+    """Return the success of three attacks on one update, by noise multiplier."""
+    one = found[found.saw == "one update"]
+    columns = {}
+    for trait in ("task", "place"):
+        table = one[(one.attack == trait) & (one.steps == steps)].groupby("noise")[["right", "of"]].sum()
+        columns[f"{trait}: labs guessed right"] = table.right / table.of
+    members = one[(one.attack == "member") & (one.demos == demos)]
+    columns[f"member of {demos} demonstrations: area under the curve"] = members.groupby("noise").apply(
+        lambda rows: membership.auc(*_scores(rows)), include_groups=False
+    )
+    table = pd.DataFrame(columns)
+    return table.set_axis(table.index.where(table.index > 0, LOWEST), axis=0)
+
+
+def noise_axis(ax: Any) -> None:
+    """Scale the axis of `by_noise`, and draw what chance reaches."""
+    ax.set_xscale("log")
+    ax.set_xticks([LOWEST, 1e-2, 1e-1], ["none", "0.01", "0.1"])
+    ax.set_ylim(0, 1.05)
+    for chance in sorted(set(CHANCE.values())):
+        ax.axhline(chance, linestyle=":", color="gray")
+        ax.annotate("chance", (1, chance), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+
+
+def states(found: pd.DataFrame) -> pd.DataFrame:
+    """Return the median error of the joint state, in degrees, for each kind of message and of training."""
+    rows = found[found.attack == "state"]
+    table = rows.pivot_table(index="case", columns="saw", values="error_deg", aggfunc="median", sort=False)
+    table["blind"] = rows.groupby("case").blind_deg.median()
+    return table.rename_axis(index="median error [degrees]", columns=None).round(2)
+
+
+def images(found: pd.DataFrame) -> str:
+    """Return a sentence on the search for images."""
+    rows = found[found.attack == "image"]
+    parts = [
+        f"With {trained} trained, the gradient of the image found agrees to {group.cosine.median():.3f} (cosine), and "
+        f"the image is {group.psnr_db.median():.1f} dB from the true one; the mean image of the attacker's own "
+        f"recording is {group.blind_db.median():.1f} dB."
+        for trained, group in rows.groupby("trained", sort=False)
+    ]
+    better = (rows.psnr_db > rows.blind_db).mean()
+    return " ".join([*parts, f"The search beat the mean image in {better:.0%} of {len(rows)} images."])
+
+
+def members(found: pd.DataFrame) -> pd.DataFrame:
+    """Return the separation of trained demonstrations, without noise, by what was seen."""
+    rows = found[(found.attack == "member") & (found.noise == 0)]
+    table = [_separated(key, group) for key, group in rows.groupby(["saw", "demos", "round"], sort=False)]
+    return pd.DataFrame(table).rename(columns={"demos": "demonstrations a lab"}).set_index("seen")
+
+
+def protections(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFrame:
+    """Return the attacks under each protection: what the server sees of a lab, with intervals."""
+    cases = {
+        "none": ("one update", 0.0), "noise 0.01 of each lab": ("one update", 0.01),
+        "noise 0.1 of each lab": ("one update", 0.1), "noise 0.3 of each lab": ("one update", 0.3),
+        "sums only": ("the mean of ten", 0.0),
+    }  # fmt: skip
+    table = {name: _attacked(found, saw, noise, steps, demos) for name, (saw, noise) in cases.items()}
+    chance = {"task": "50%", "place": "10%", "member (area)": "0.50"}
+    return pd.DataFrame({**table, "chance": chance}).T
+
+
+def _attacked(found: pd.DataFrame, saw: str, noise: float, steps: int, demos: int) -> dict[str, str]:
+    rows, cells = found[(found.saw == saw) & (found.noise == noise)], {}
+    for trait in ("task", "place"):
+        right, count = rows[(rows.attack == trait) & (rows.steps == steps)][["right", "of"]].sum()
+        low, high = proportion_confint(right, count, method="wilson")
+        cells[trait] = f"{right / count:.0%} {interval(low, high)}"
+    member = rows[(rows.attack == "member") & (rows.demos == demos)]
+    cells["member (area)"] = _area(member) if len(member) else "not possible"
+    return cells
+
+
+def _area(rows: pd.DataFrame) -> str:
+    scores = _scores(rows)
+    low, high = membership.auc_interval(*scores)
+    return f"{membership.auc(*scores):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _separated(key: tuple[str, int, int], rows: pd.DataFrame) -> dict[str, object]:
+    inside, outside = _scores(rows)
+    found = membership.true_positives(inside, outside)
+    return {"seen": key[0], "demos": int(key[1]), "round": int(key[2]), "area [95 %]": _area(rows),
+            "found at 1 %": f"{found:.0%}", "asked": len(inside) + len(outside)}  # fmt: skip
+
+
+def _scores(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    return np.concatenate([*rows.members]), np.concatenate([*rows.strangers])
