@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fedvla_book.attacks import membership, reconstruction, results, traits
+from fedvla_book.attacks import membership, reconstruction, results, separation, traits
 from fedvla_lib.config import from_profile
 from fedvla_lib.data.batches import batch_of_rows
 from fedvla_lib.experiments import methods
@@ -31,16 +31,16 @@ def test_a_trait_is_guessed_from_the_direction_of_an_update_whatever_its_length(
 def test_separation_is_measured_against_chance():
     rng = np.random.default_rng(1)
     same, apart = rng.normal(size=400), rng.normal(size=400) + 5
-    assert membership.auc(same, rng.normal(size=400)) == pytest.approx(0.5, abs=0.06)
-    assert membership.auc(apart, same) > 0.99 and membership.true_positives(apart, same) > 0.9
-    assert membership.auc(np.array([1.0, 3.0]), np.array([2.0, 0.0])) == 0.75
-    assert membership.true_positives(same, same) <= 0.01
+    assert separation.auc(same, rng.normal(size=400)) == pytest.approx(0.5, abs=0.06)
+    assert separation.auc(apart, same) > 0.99 and separation.true_positives(apart, same) > 0.9
+    assert separation.auc(np.array([1.0, 3.0]), np.array([2.0, 0.0])) == 0.75
+    assert separation.true_positives(same, same) <= 0.01
 
 
 def test_the_interval_of_an_area_covers_it_in_nineteen_of_twenty_samples():
     rng, true, covered = np.random.default_rng(2), 0.7602, 0  # two normal distributions, one apart by 1
     for _ in range(300):
-        low, high = membership.auc_interval(rng.normal(size=40) + 1, rng.normal(size=40))
+        low, high = separation.auc_interval(rng.normal(size=40) + 1, rng.normal(size=40))
         covered += low <= true <= high
     assert 0.91 < covered / 300 < 0.985
 
@@ -83,7 +83,7 @@ def test_a_model_gives_away_the_demonstrations_that_it_was_trained_on(tiny):
     one.train(bundle, 1)
     scores = before - membership.losses(bundle, one.store, asked, config.chunk_size, 0)
     inside, outside = np.split(scores, [len(one.share.train_ids)])
-    assert inside.mean() > outside.mean() and membership.auc(inside, outside) > 0.5
+    assert inside.mean() > outside.mean() and separation.auc(inside, outside) > 0.5
 
 
 @pytest.mark.integration

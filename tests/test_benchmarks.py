@@ -55,6 +55,12 @@ def test_the_base_is_trained_and_acts(run):
     assert row["demonstrations"] == 2 and row["rollouts"] == 1 and row["training [s]"] > 0
 
 
+def test_secure_aggregation_is_measured_beside_the_clear(run):
+    few, more = run("secure_aggregation", "--clients", "3", "5")
+    assert few["masked [s]"] > few["in the clear [s]"] > 0 and few["added bytes of a client [kB]"] > 1
+    assert more["clients"] == 5 and more["added bytes of a client [kB]"] > few["added bytes of a client [kB]"]
+
+
 def test_bad_input_is_one_line_that_names_it(tmp_path, warm_python):
     command = [warm_python, FOLDER / "fine_tuning.py", "--tasks", "juggle", "--out", tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)

@@ -360,7 +360,8 @@ def test_noise_by_all_together_protects_against_the_server_too(tiny):
     left, right = (global_weights(one, 2) for one in (root, again))
     assert all(np.array_equal(left[name], right[name]) for name in left)  # the masks are secret, and cancel
     events = run_folder.read_metrics(root, "privacy")
-    assert events.epsilon[1] == pytest.approx(accountant.epsilon(replace(config, noise_by="server"), 2, 0), rel=0.05)
+    gauss = accountant.epsilon(replace(config, noise_by="server"), 2, 0)
+    assert gauss < events.epsilon[1] < 1.3 * gauss  # of whole orders only, few of which fit so little noise
 
 
 @pytest.mark.integration

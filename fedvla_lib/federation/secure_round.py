@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -72,9 +73,9 @@ class SecureGrid:
         replies = _by_client(sent, self._grid.send_and_receive(list(sent.values()), timeout=timeout))
         vectors, refused = self._vectors(sent, replies)
         trained = time.perf_counter()
-        total = np.sum(list(vectors.values()), axis=0, dtype=np.uint32) if vectors else np.zeros(0, np.uint32)
         self._enough(len(vectors), len(orders), "sent their masked update")
-        mean = secure.grid_for(self._config).real(self._unmask(orders, state, vectors, total, timeout)) / len(vectors)
+        total = self._unmask(orders, state, vectors, reduce(np.add, vectors.values()), timeout)
+        mean = secure.grid_for(self._config).real(total) / len(vectors)
         self._check_length(mean)
         round_number = orders[0].content[messages.CONFIG][messages.ROUND]
         seconds = time.perf_counter() - trained + prepared - began

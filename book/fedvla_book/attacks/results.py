@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from statsmodels.stats.proportion import proportion_confint
 
-from fedvla_book.attacks import membership
+from fedvla_book.attacks import separation
 from fedvla_book.sentences import interval
 
 LOWEST = 1e-3  # where the axis shows the noise 0
@@ -29,10 +29,10 @@ def by_noise(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFra
     columns = {}
     for trait in ("task", "place"):
         table = one[(one.attack == trait) & (one.steps == steps)].groupby("noise")[["right", "of"]].sum()
-        columns[f"{trait}: labs guessed right"] = table.right / table.of
+        columns[f"{trait} guessed"] = table.right / table.of
     members = one[(one.attack == "member") & (one.demos == demos)]
-    columns[f"member of {demos} demonstrations: area under the curve"] = members.groupby("noise").apply(
-        lambda rows: membership.auc(*_scores(rows)), include_groups=False
+    columns["member (area)"] = members.groupby("noise").apply(
+        lambda rows: separation.auc(*_scores(rows)), include_groups=False
     )
     table = pd.DataFrame(columns)
     return table.set_axis(table.index.where(table.index > 0, LOWEST), axis=0)
@@ -101,15 +101,15 @@ def _attacked(found: pd.DataFrame, saw: str, noise: float, steps: int, demos: in
 
 def _area(rows: pd.DataFrame) -> str:
     scores = _scores(rows)
-    low, high = membership.auc_interval(*scores)
-    return f"{membership.auc(*scores):.2f} [{low:.2f}, {high:.2f}]"
+    low, high = separation.auc_interval(*scores)
+    return f"{separation.auc(*scores):.2f} [{low:.2f}, {high:.2f}]"
 
 
 def _separated(key: tuple[str, int, int], rows: pd.DataFrame) -> dict[str, object]:
     inside, outside = _scores(rows)
-    found = membership.true_positives(inside, outside)
+    found = separation.true_positives(inside, outside)
     return {"seen": key[0], "demos": int(key[1]), "round": int(key[2]), "area [95 %]": _area(rows),
-            "found at 1 %": f"{found:.0%}", "asked": len(inside) + len(outside)}  # fmt: skip
+            "found at 1 in 100": f"{found:.0%}", "asked": len(inside) + len(outside)}  # fmt: skip
 
 
 def _scores(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
