@@ -2,13 +2,15 @@
 
     python book/tools/attack_study.py --seed 0 --out book/reference/attacks
 
-Writes ``seed_0.json``: a stamp and one row for each measurement. Labs with one task each, 8 demonstrations, as in
+Writes ``seed_0_PART.json`` for each part, a stamp and one row for each measurement; parts that are there are skipped,
+so that it can be interrupted. Labs with one task each, 8 demonstrations, as in
 ten_labs.toml; the attacker's own clients are in the same kinds of lab, with other demonstrations.
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -209,28 +211,32 @@ def _nearest(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.sqrt(np.square(found - true).mean(axis=1)).min())
 
 
-def study(seed: int) -> Iterator[Row]:
-    """All attacks for one training seed."""
-    yield from what_it_saw(seed)
-    yield from which_image(seed)
-    yield from what_a_lab_does(seed)
-    for demos in (2, 8):
-        yield from who_was_in_an_update(seed, demos)
-        yield from who_was_in_it(seed, demos, SERVER_NOISE if demos == 2 else (0.0,))
+PARTS: dict[str, Callable[[int], Iterator[Row]]] = {
+    "state": what_it_saw,
+    "traits": what_a_lab_does,
+    "update-2": partial(who_was_in_an_update, demos=2),
+    "update-8": partial(who_was_in_an_update, demos=8),
+    "image": which_image,
+    "model-2": partial(who_was_in_it, demos=2, noises=SERVER_NOISE),
+    "model-8": partial(who_was_in_it, demos=8, noises=(0.0,)),
+}
 
 
 def main() -> None:
-    """Read the command line, run the study, and write the file."""
+    """Read the command line, run the parts of the study that are not there yet, and write a file for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, required=True, help="training seed")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the result")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     given = parser.parse_args()
-    stamp = provenance.first_stamp(settings(given.seed), "attack")
-    rows = [{"seed": given.seed} | row for row in tqdm(study(given.seed), desc="measurements")]
     given.out.mkdir(parents=True, exist_ok=True)
-    target = given.out / f"seed_{given.seed}.json"
-    files.write_json(target, stamp | {"status": "completed", "rows": rows})
-    print(f"{len(rows)} measurements in {target}")
+    for name, part in PARTS.items():
+        target = given.out / f"seed_{given.seed}_{name}.json"
+        if target.exists():
+            continue
+        stamp = provenance.first_stamp(settings(given.seed), "attack")
+        rows = [{"seed": given.seed} | row for row in tqdm(part(given.seed), desc=name)]
+        files.write_json(target, stamp | {"status": "completed", "rows": rows})
+        print(f"{len(rows)} measurements in {target}")
 
 
 if __name__ == "__main__":
