@@ -47,7 +47,8 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
-        client = _client(context, loaders)
+        with _reasons_kept(context):
+            client = _client(context, loaders)
         known = {"partition_id": client.partition_id, "num_examples": _weight(client)}
         known["tasks"] = [] if privacy.hides_updates(client.config) else client.tasks
         asked = normalisation.asks_clients(client.config)
@@ -56,8 +57,8 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
-        client = _client(context, loaders)
-        with _reasons_kept(client.config):
+        with _reasons_kept(context):
+            client = _client(context, loaders)
             bundle = _policy(client, message, loaders, context)
             return Message(_trained(client, bundle, message, context), reply_to=message)
 
@@ -202,14 +203,14 @@ def _spend(client: Client, context: Context, size: int) -> None:
 
 
 @contextmanager
-def _reasons_kept(config: Config) -> Iterator[None]:
+def _reasons_kept(context: Context) -> Iterator[None]:
     """Keep the text of an error, which may tell of the data, from a server that must not see updates either."""
     try:
         yield
     except Exception:
-        if not privacy.hides_updates(config):
+        if not privacy.hides_updates(from_run_config(context.run_config)):
             raise
-        logger.exception("this client's training failed")
+        logger.exception("this client failed")
         raise RuntimeError("this client failed; the reason is in its own log") from None
 
 

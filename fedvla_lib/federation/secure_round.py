@@ -81,7 +81,8 @@ class SecureGrid:
         seconds = time.perf_counter() - trained + prepared - began
         counts = {"clients": len(orders), "summed": len(vectors), "lost": len(orders) - len(vectors)}
         self._report(round_number, GLOBAL, "secure", counts | {"bytes": self._bytes, "seconds": seconds})
-        return [_with_mean(sent[me], replies[me], self._payload(mean)) for me in vectors] + refused
+        records = _mean_records(orders[0], self._payload(mean))
+        return [_with_mean(sent[me], replies[me], records) for me in vectors] + refused
 
     def _prepare(self, orders: dict[int, Message], timeout: float | None) -> Round:
         """Collect public keys and encrypted shares; those who do not answer are left out of the round."""
@@ -185,18 +186,21 @@ def _by_client(orders: dict[int, Message], replies: Iterable[Message]) -> dict[i
     return {place[reply.metadata.src_node_id]: reply for reply in replies}
 
 
-def _with_mean(order: Message, reply: Message, mean: privacy.Payload) -> Message:
-    """Return a client's reply, with the mean of all in place of its masked vector."""
+def _mean_records(order: Message, mean: privacy.Payload) -> RecordDict:
+    """Return what all replies of a round have in common: the global arrays plus the mean, and the digests."""
     start = messages.unpack_arrays(order.content[messages.ARRAYS])
     arrays = {name: array + mean[messages.ARRAYS][name] for name, array in start.items()}
-    content = RecordDict({
-        messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: reply.content[messages.METRICS],
-        messages.NOTE: messages.make_note(sha256=digest(arrays)),
-    })  # fmt: skip
+    note = messages.make_note(sha256=digest(arrays))
+    content = RecordDict({messages.ARRAYS: messages.pack_arrays(arrays), messages.NOTE: note})
     for record, extra in mean.items():
         if record != messages.ARRAYS:
             messages.attach(content, messages.NOTE, record, extra)
-    return Message(content, reply_to=order)
+    return content
+
+
+def _with_mean(order: Message, reply: Message, records: RecordDict) -> Message:
+    """Return a client's reply, with the records of the mean in place of its masked vector."""
+    return Message(RecordDict({**records, messages.METRICS: reply.content[messages.METRICS]}), reply_to=order)
 
 
 def _with_letter(order: Message, letter: ConfigRecord) -> Message:
