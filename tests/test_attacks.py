@@ -108,7 +108,7 @@ def stored(folder):
                 rows.append({"attack": trait, "saw": saw, "steps": 40, "noise": noise, "right": right, "of": 10})
         scores = {"members": [2.0, 3.0, 4.0], "strangers": [0.0, 1.0, 2.5]}
         rows.append({"attack": "member", "saw": "one update", "round": 1, "demos": 2, "noise": noise, **scores})
-    rows.append({"attack": "member", "saw": "the global model", "round": 10, "demos": 2, "noise": 0.0, **scores})
+    rows.append({"attack": "member", "saw": "the global model", "round": 1, "demos": 2, "noise": 0.0, **scores})
     rows += [{"attack": "state", "saw": saw, "case": "gradient", "blind_deg": 10.0, "error_deg": error}
              for saw, error in (("update", 0.001), ("update in 8 bits", None))]  # fmt: skip
     rows += [{"attack": "image", "saw": "gradient", "trained": "everything", "camera": "front", "cosine": 0.99,
@@ -123,8 +123,10 @@ def test_stored_attacks_become_tables(tmp_path):
     found = stored(tmp_path)
     lines = results.by_noise(found)
     assert lines.index.tolist() == [results.LOWEST, 0.01, 0.1, 0.3] and lines.iloc[0, 0] == 1.0
-    assert results.states(found).loc["gradient"].to_dict() == {"update": 0.0, "blind": 10.0}
+    read = {"update": 0.0, "update in 8 bits": "not possible", "blind": 10.0}
+    assert results.states(found).loc["gradient"].to_dict() == read
     assert "9.0 dB" in results.images(found) and "0% of 1 images" in results.images(found)
     table = results.protections(found)
-    assert table.loc["none", "task"].startswith("100%") and table.loc["sums only", "member (area)"] == "not possible"
+    assert [name for name in table.index if "noise" in name] == [f"noise {z} of each lab" for z in (0.01, 0.1, 0.3)]
+    assert table.loc["none", "task"].startswith("100%") and table.loc["sums only", "member (area)"].startswith("0.8")
     assert results.members(found).loc["one update", "asked"] == 6

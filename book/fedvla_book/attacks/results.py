@@ -41,7 +41,7 @@ def by_noise(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFra
 def noise_axis(ax: Any) -> None:
     """Scale the axis of `by_noise`, and draw what chance reaches."""
     ax.set_xscale("log")
-    ax.set_xticks([LOWEST, 1e-2, 1e-1], ["none", "0.01", "0.1"])
+    ax.set_xticks([LOWEST, 1e-2, 1e-1, 1], ["none", "0.01", "0.1", "1"])
     ax.set_ylim(0, 1.05)
     for chance in sorted(set(CHANCE.values())):
         ax.axhline(chance, linestyle=":", color="gray")
@@ -51,9 +51,11 @@ def noise_axis(ax: Any) -> None:
 def states(found: pd.DataFrame) -> pd.DataFrame:
     """Return the median error of the joint state, in degrees, for each kind of message and of training."""
     rows = found[found.attack == "state"]
-    table = rows.pivot_table(index="case", columns="saw", values="error_deg", aggfunc="median", sort=False)
+    table = rows.pivot_table(
+        index="case", columns="saw", values="error_deg", aggfunc="median", sort=False, dropna=False
+    )
     table["blind"] = rows.groupby("case").blind_deg.median()
-    return table.rename_axis(index="median error [degrees]", columns=None).round(2)
+    return table.rename_axis(index="median error [degrees]", columns=None).round(2).fillna("not possible")
 
 
 def images(found: pd.DataFrame) -> str:
@@ -70,19 +72,21 @@ def images(found: pd.DataFrame) -> str:
 
 
 def members(found: pd.DataFrame) -> pd.DataFrame:
-    """Return the separation of trained demonstrations, without noise, by what was seen."""
-    rows = found[(found.attack == "member") & (found.noise == 0)]
-    table = [_separated(key, group) for key, group in rows.groupby(["saw", "demos", "round"], sort=False)]
+    """Return the separation of trained demonstrations, by what was seen; noise is what the server added."""
+    rows = found[(found.attack == "member") & ((found.noise == 0) | (found.saw == "the global model"))]
+    table = [_separated(key, group) for key, group in rows.groupby(["saw", "demos", "round", "noise"], sort=False)]
     return pd.DataFrame(table).rename(columns={"demos": "demonstrations a lab"}).set_index("seen")
 
 
 def protections(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFrame:
-    """Return the attacks under each protection: what the server sees of a lab, with intervals."""
-    cases = {
-        "none": ("one update", 0.0), "noise 0.01 of each lab": ("one update", 0.01),
-        "noise 0.1 of each lab": ("one update", 0.1), "noise 0.3 of each lab": ("one update", 0.3),
-        "sums only": ("the mean of ten", 0.0),
-    }  # fmt: skip
+    """Return the attacks under each protection: what the server finds out about a lab, with intervals.
+
+    Where it sees sums only, it can look for members in the global model, as every lab can.
+    """
+    levels = sorted(noise for noise in found[found.saw == "one update"].noise.unique() if noise)
+    cases = {"none": ("one update", 0.0)}
+    cases |= {f"noise {noise:g} of each lab": ("one update", noise) for noise in levels}
+    cases["sums only"] = ("the mean of ten", 0.0)
     table = {name: _attacked(found, saw, noise, steps, demos) for name, (saw, noise) in cases.items()}
     chance = {"task": "50%", "place": "10%", "member (area)": "0.50"}
     return pd.DataFrame({**table, "chance": chance}).T
@@ -94,8 +98,9 @@ def _attacked(found: pd.DataFrame, saw: str, noise: float, steps: int, demos: in
         right, count = rows[(rows.attack == trait) & (rows.steps == steps)][["right", "of"]].sum()
         low, high = proportion_confint(right, count, method="wilson")
         cells[trait] = f"{right / count:.0%} {interval(low, high)}"
-    member = rows[(rows.attack == "member") & (rows.demos == demos)]
-    cells["member (area)"] = _area(member) if len(member) else "not possible"
+    seen = "the global model" if saw == "the mean of ten" else saw
+    member = found[(found.attack == "member") & (found.saw == seen) & (found.noise == noise)]
+    cells["member (area)"] = _area(member[(member["round"] == 1) & (member.demos == demos)])
     return cells
 
 
@@ -105,10 +110,11 @@ def _area(rows: pd.DataFrame) -> str:
     return f"{separation.auc(*scores):.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _separated(key: tuple[str, int, int], rows: pd.DataFrame) -> dict[str, object]:
+def _separated(key: tuple[str, int, int, float], rows: pd.DataFrame) -> dict[str, object]:
     inside, outside = _scores(rows)
     found = separation.true_positives(inside, outside)
-    return {"seen": key[0], "demos": int(key[1]), "round": int(key[2]), "area [95 %]": _area(rows),
+    return {"seen": key[0], "demos": int(key[1]), "round": int(key[2]), "noise": key[3],
+            "area [95 %]": _area(rows),
             "found at 1 in 100": f"{found:.0%}", "asked": len(inside) + len(outside)}  # fmt: skip
 
 
