@@ -68,11 +68,11 @@ def new_environment(book: Path) -> Path:
 def surroundings(python: Path) -> dict[str, str]:
     """Return the environment variables of a shell with that Python's environment activated.
 
-    Chapters compute on one thread, so that several can run in parallel.
+    Chapters compute on one thread and in one process, so that several can run in parallel.
     """
     outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     path = f"{python.parent}{os.pathsep}{outside['PATH']}"
-    return {"OMP_NUM_THREADS": "1"} | outside | {"FEDVLA_PROFILE": "tiny", "PATH": path}
+    return {"OMP_NUM_THREADS": "1", "FEDVLA_JOBS": "1"} | outside | {"FEDVLA_PROFILE": "tiny", "PATH": path}
 
 
 def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()) -> int:
