@@ -57,8 +57,11 @@ class RunFolder:
 
 
 @contextmanager
-def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
+def start(config: Config, *, engine: str, **beside: Any) -> Iterator[RunFolder]:
     """Create ``<config.out>/<YYYYmmdd_HHMMSS>/`` or reopen ``config.resume``; stamp how the run ended on exit.
+
+    Args:
+        beside: what decides the result beside the settings, for the stamp.
 
     Raises:
         ValueError: the folder cannot be written, or the run to be resumed cannot be, or is still running.
@@ -66,7 +69,7 @@ def start(config: Config, *, engine: str) -> Iterator[RunFolder]:
     began = time.perf_counter()
     root = _existing(Path(config.resume)) if config.resume else _make_folder(Path(config.out))
     with hold(root):
-        stamp = first_stamp(config, engine)
+        stamp = first_stamp(config, engine) | beside
         if config.resume:
             earlier = resumable(root, config)
             stamp |= {"started": earlier["started"], "resumed": [*earlier.get("resumed", []), stamp["started"]]}
@@ -105,7 +108,8 @@ def is_held(root: Path) -> bool:
 
 def forget_after(root: Path, round_number: int) -> None:
     """Delete the events, models and videos of rounds after `round_number`, which are about to be repeated."""
-    kept = [event for event in read_events(root) if event["round"] <= round_number]
+    events = read_events(root) if (root / METRICS_FILE).is_file() else []  # a run may end before its first
+    kept = [event for event in events if event["round"] <= round_number]
     write_atomically(root / METRICS_FILE, b"".join((json.dumps(event) + "\n").encode() for event in kept))
     for folder in [*root.glob("global_model/round_*"), *root.glob("evaluate/round_*")]:
         if int(folder.name.removeprefix("round_")) > round_number:

@@ -142,12 +142,18 @@ def test_resumed_training_ends_like_an_uninterrupted_one(tmp_path, capsys):
     assert main(["train", "--steps", "2", *common, str(halves)]) == 0
     root = next(halves.iterdir())
     _undo_last_step(root)
-    assert main(["train", "--resume", str(root), "--client", "1", "--steps", "2"]) == 0
+    for wrong in ("--client=0", "--steps=5"):
+        assert main(["train", "--resume", str(root), wrong]) == 2
+        assert "cannot be given with --resume: a training keeps its own" in capsys.readouterr().err
+    assert main(["run", "--resume", str(root)]) == 2
+    assert "is a folder of fedvla train: fedvla run or deploy cannot resume it" in capsys.readouterr().err
+    assert main(["train", "--resume", str(root)]) == 0
     counted = run_folder.read_metrics(root, "evaluate").gradient_steps
     assert counted.iloc[-1] == 2 and "2 steps in" in capsys.readouterr().out
     weights = [next(path.glob("*/model/model.safetensors")) for path in (whole, halves)]
     assert weights[0].read_bytes() == weights[1].read_bytes()
-    assert json.loads((root / "stamp.json").read_text())["status"] == "completed"
+    stamp = json.loads((root / "stamp.json").read_text())
+    assert stamp["status"] == "completed" and (stamp["client"], stamp["steps"]) == (1, 2)
 
 
 def _undo_last_step(root: Path) -> None:

@@ -28,7 +28,7 @@ from fedvla_lib.cli.main import main
 from fedvla_lib.cli.parser import build_parser
 from fedvla_lib.config import from_profile, to_run_config
 from fedvla_lib.data import record
-from fedvla_lib.engines import credentials, deployment, processes, superlink
+from fedvla_lib.engines import credentials, deployment, guard, processes, superlink
 from fedvla_lib.engines.inline import run_inline
 from fedvla_lib.engines.warm_start import FORK_SERVER
 from fedvla_lib.federation import client, client_app
@@ -56,6 +56,55 @@ def forget(message, context, call_next):
 
 def apart(left, right):
     return max(np.abs(left[name] - right[name]).max() for name in left)
+
+
+STARTED = """
+import sys, time
+from pathlib import Path
+from fedvla_lib.engines.deployment import running_deployment
+with running_deployment(Path(sys.argv[1]), 1) as deployment:
+    print("running", flush=True)
+    time.sleep(600)
+"""
+
+
+def at_home(home):
+    """Names of the processes with a FLWR_HOME in a folder."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if process.environ().get("FLWR_HOME", "").startswith(str(home)):
+                found.append(" ".join(process.cmdline()))
+    return found
+
+
+def test_nothing_of_a_killed_deployment_is_left_running_and_no_key_is_left_behind(tmp_path):
+    home = tmp_path / "a home"
+    home.mkdir()
+    with subprocess.Popen([sys.executable, "-c", STARTED, str(home)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "running\n"
+        running = " ".join(at_home(home))
+        assert "flower-supernode" in running and "flower-superlink" in running and (home / "keys").exists()
+        process.kill()
+    deadline = time.monotonic() + 30
+    while at_home(home) or (home / "keys").exists():
+        assert time.monotonic() < deadline, at_home(home)
+        time.sleep(0.2)
+    assert not (home / "server").exists()
+
+
+def test_a_home_that_nobody_uses_is_cleared_and_a_fresh_one_is_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(guard.tempfile, "gettempdir", lambda: str(tmp_path))
+    old, fresh, used = (tmp_path / f"fedvla-test-{name}" for name in ("old", "fresh", "used"))
+    for home in (old, fresh, used):
+        home.mkdir()
+    for home in (old, used):
+        os.utime(home, (0, 0))
+    environment = os.environ | {"FLWR_HOME": str(used / "node_0")}
+    with subprocess.Popen(["sleep", "60"], env=environment) as process:
+        guard.clear("fedvla-test-")
+        process.kill()
+    assert not old.exists() and fresh.exists() and used.exists()
 
 
 def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_from_its_own_data(

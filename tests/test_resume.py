@@ -37,8 +37,11 @@ def tiny(recording, tmp_path):
     )  # fmt: skip
 
 
-def start_until(config, round_number, engine_name="inline"):
-    """Start a run in a process and wait until clients train in a round; return the process and the run folder."""
+def start_until(config, round_number, engine_name="inline", written="checkpoints/round_{}"):
+    """Start a run in a process and wait until clients train in a round; return the process and the run folder.
+
+    With `written` until the round before has written that.
+    """
     given = {key: value for key, value in to_run_config(config).items() if key != "resume" and value != ""}
     switches = [f"--{key}" if value else f"--no-{key}" for key, value in given.items() if isinstance(value, bool)]
     values = [f"--{key}={value}" for key, value in given.items() if not isinstance(value, bool)]
@@ -48,16 +51,16 @@ def start_until(config, round_number, engine_name="inline"):
         preexec_fn=heed_interrupts,
     )  # fmt: skip
     deadline = time.monotonic() + 300
-    # The round before has its checkpoint, so this one has begun.
-    while not (found := list(Path(config.out).glob(f"*/checkpoints/round_{round_number - 1}"))):
+    # Once the round before has its checkpoint, this one has begun.
+    while not (found := list(Path(config.out).glob(f"*/{written.format(round_number - 1)}"))):
         assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
         time.sleep(0.005)
     return process, found[0].parents[1]
 
 
-def start_and_kill(config, round_number, engine_name="inline"):
+def start_and_kill(config, *until):
     """Kill all processes while clients train in a round, as a power cut would; return the run folder."""
-    process, root = start_until(config, round_number, engine_name)
+    process, root = start_until(config, *until)
     assert run_folder.read_stamp(root)["status"] == "running"
     for one in [*psutil.Process(process.pid).children(recursive=True), process]:
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -135,6 +138,22 @@ def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, setti
     assert_same_bits(last_model(root), last_model(whole))
     assert run_folder.read_stamp(root)["status"] == "completed" and run_folder.read_stamp(root)["resumed"]
     for kind in ("train", "evaluate", "drift", "data"):
+        found, wanted = (run_folder.read_metrics(one, kind)[["round", "who"]] for one in (root, whole))
+        assert found.values.tolist() == wanted.values.tolist()
+
+
+@pytest.mark.integration
+@pytest.mark.slow
+@pytest.mark.parametrize("written", ["checkpoints/round_{}", "global_model/round_{}"], ids=["in round 1", "in round 0"])
+def test_a_run_killed_before_a_round_was_complete_is_resumed_too(tiny, written, capsys):
+    config = replace(tiny, num_server_rounds=1)
+    whole = inline.run_inline(config, progress=False)
+    root = start_and_kill(replace(config, out=config.out + "_ended"), 1, "inline", written)
+    assert main(["train", "--resume", str(root)]) == 2
+    assert "is a folder of fedvla run or deploy: fedvla train cannot resume it" in capsys.readouterr().err
+    assert main(["run", "--resume", str(root)]) == 0
+    assert_same_bits(last_model(root, 1), last_model(whole, 1))
+    for kind in ("train", "evaluate", "data"):
         found, wanted = (run_folder.read_metrics(one, kind)[["round", "who"]] for one in (root, whole))
         assert found.values.tolist() == wanted.values.tolist()
 

@@ -354,6 +354,18 @@ def test_a_client_that_does_not_reply_is_reported():
     assert events.rejected() == {"client_1": "silent"}
 
 
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [({"strategy": "fedadam"}, "v_t of 'weight'"), ({"strategy": "fedavgm", "server_lr": 1e10}, "arrays of 'weight'")],
+    ids=["in the state", "in the model"],
+)
+def test_an_average_that_overflows_ends_the_run_although_each_reply_is_finite(settings, what):
+    """With an infinite second moment FedAdam would never move the model again, and report completed rounds."""
+    huge = {name: np.full(shape, 1e30, np.float32) for name, shape in SHAPES.items()}
+    with pytest.raises(FloatingPointError, match=f"round 4: the average overflowed .{what} is not finite"):
+        one_round(answering(lambda k, _: reply_content(huge)), 2, server_round=4, **settings)
+
+
 def test_too_few_valid_replies_stop_the_run_with_a_clear_message():
     app = answering(lambda k, _: reply_content(_nan(GOOD)) if k else reply_content(GOOD))
     with pytest.raises(TooFewReplies, match="round 4: 1 of 3 training replies are valid, min-replies=2"):

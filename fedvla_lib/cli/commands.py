@@ -78,23 +78,36 @@ def train(options: argparse.Namespace) -> None:
     """Train one policy, on all data or on one client's, into a run folder."""
     from fedvla_lib.run_folder import start
 
-    chosen = _new_or_resumed(options)
-    with start(chosen, engine="local") as folder:
-        _train_into(folder, chosen, options)
+    chosen = _new_or_resumed(options, of_train=True)
+    client, steps = _trained_on(options, chosen)
+    with start(chosen, engine=LOCAL, client=client, steps=steps) as folder:
+        _train_into(folder, chosen, client, steps)
 
 
-def _train_into(folder: Any, chosen: Config, options: argparse.Namespace) -> None:
+def _trained_on(options: argparse.Namespace, chosen: Config) -> tuple[int | None, int]:
+    """Return the client (None: all data) and the number of gradient steps; a resumed training keeps its own."""
+    from fedvla_lib.experiments.methods import steps_in_a_row
+    from fedvla_lib.run_folder import read_stamp
+
+    if not options.resume:
+        return options.client, options.steps or steps_in_a_row(chosen)
+    if given := [name for name in ("client", "steps") if getattr(options, name) is not None]:
+        raise ValueError(f"--{given[0]} cannot be given with --resume: a training keeps its own")
+    stamp = read_stamp(options.resume)
+    return stamp["client"], stamp["steps"]
+
+
+def _train_into(folder: Any, chosen: Config, client: int | None, steps: int) -> None:
     from fedvla_lib.evaluation.measure import log_measurement, measure
     from fedvla_lib.evaluation.rollouts import rollout_seeds
-    from fedvla_lib.experiments.methods import steps_in_a_row, train_alone
+    from fedvla_lib.experiments.methods import train_alone
     from fedvla_lib.federation.client import open_client, open_pooled
     from fedvla_lib.policy.model import load_policy, save_policy
     from fedvla_lib.policy.training import Checkpoints
 
-    learner = open_pooled(chosen) if options.client is None else open_client(chosen, options.client)
+    learner = open_pooled(chosen) if client is None else open_client(chosen, client)
     bundle = load_policy(chosen, learner.statistics())
-    steps = options.steps or steps_in_a_row(chosen)
-    checkpoints = Checkpoints(folder.root / "checkpoints", resume=options.resume is not None)
+    checkpoints = Checkpoints(folder.root / "checkpoints", resume=bool(chosen.resume))
     result = train_alone(bundle, learner, steps=steps, checkpoints=checkpoints)
     save_policy(bundle, folder.root / "model")
     found = measure(
@@ -121,8 +134,11 @@ def run(options: argparse.Namespace) -> None:
     _print_rounds(inline.run_inline(config, jobs=jobs))
 
 
-def _new_or_resumed(options: argparse.Namespace) -> Config:
+def _new_or_resumed(options: argparse.Namespace, of_train: bool = False) -> Config:
     """Return the settings of a new run, or of the interrupted run to resume.
+
+    Args:
+        of_train: the folder has to be of ``fedvla train``, and else of a federation.
 
     Raises:
         ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
@@ -138,7 +154,10 @@ def _new_or_resumed(options: argparse.Namespace) -> Config:
     threads = {"num_threads": options.num_threads} if "num_threads" in vars(options) else {}
     chosen = replace(read_config(options.resume), resume=str(options.resume.resolve()), **threads)
     with hold(options.resume):  # fails here rather than after the engine has started its processes
-        resumable(options.resume, chosen)
+        stamp = resumable(options.resume, chosen)
+    if (stamp["engine"] == LOCAL) != of_train:
+        commands = ("fedvla run or deploy", "fedvla train")[:: 1 if of_train else -1]
+        raise ValueError(f"--resume {options.resume} is a folder of {commands[0]}: {commands[1]} cannot resume it")
     return chosen
 
 

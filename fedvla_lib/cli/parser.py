@@ -103,7 +103,7 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
     ]),
     (commands.config, "print the settings as TOML for flwr run --run-config", NOTHING, [PROFILE]),
     (commands.train, "train a policy without federation: on all data, or on one client's partition",
-     "checkpoints are in the run folder; fedvla train --resume FOLDER with the same --client and --steps continues", [
+     "checkpoints are in the run folder; fedvla train --resume FOLDER continues", [
         _flag("--client", "train on client K's partition only", "K"),
         _flag("--steps", "gradient steps (default: num-server-rounds times local-steps)", "N"), RESUME, PROFILE,
     ]),

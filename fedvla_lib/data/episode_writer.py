@@ -87,7 +87,9 @@ class EpisodeWriter:
             _put(path, self._root / path.relative_to(self._staging))
         # Unlike LeRobot's running aggregate, this does not depend on where a recording was interrupted.
         self._stats.append(_stats_of(self._root, index))
-        write_stats(aggregate_stats(self._stats), self._staging)
+        # Sorted: LeRobot aggregates in the order of a set, which differs from process to process.
+        stats = {key: dict(sorted(values.items())) for key, values in sorted(aggregate_stats(self._stats).items())}
+        write_stats(stats, self._staging)
         for name in SHARED_FILES:
             _put(self._staging / name, self._root / name)
 

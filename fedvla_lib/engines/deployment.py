@@ -17,10 +17,11 @@ from typing import Any
 
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config, absolute, check
-from fedvla_lib.engines import app_bundle, credentials, processes, superlink
+from fedvla_lib.engines import app_bundle, credentials, guard, processes, superlink
 from fedvla_lib.engines.processes import FlowerRunError
 from fedvla_lib.engines.superlink import CONNECTION, SuperLink
 
+HOME = "fedvla-deploy-"  # begins the names of temporary folders
 CONNECTED = "SuperNode ID:"  # logged by a SuperNode once the SuperLink has accepted it
 UNTRUSTED = "CERTIFICATE_VERIFY_FAILED"  # logged at each try by a SuperNode that does not trust the SuperLink
 print_line = partial(print, flush=True)  # at once, also into a pipe
@@ -139,7 +140,8 @@ def run_deployed(
     """
     config = absolute(check(replace(config, num_threads=config.num_threads or 1)))
     before = run_folder.run_folders(config)
-    with tempfile.TemporaryDirectory(prefix="fedvla-deploy-") as name:
+    guard.clear(HOME)
+    with tempfile.TemporaryDirectory(prefix=HOME) as name:
         folder = Path(name)
         with running_deployment(folder, config.num_clients, tls=tls, auth=auth, data=data) as deployment:
             say(f"{config.num_clients} SuperNodes joined the SuperLink at 127.0.0.1:{deployment.link.port}")

@@ -5,10 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from fedvla_lib.config import Config, absolute, check
-from fedvla_lib.engines import app_bundle
+from fedvla_lib.engines import app_bundle, guard
 from fedvla_lib.engines.superlink import local_superlink, require_completed
 from fedvla_lib.run_folder import own_run, run_folders
 
+HOME = "fedvla-flower-"  # begins the names of temporary folders
 # Ray 2.55 has hard-coded start-up timeouts (30 s for its server and raylet, 15 s for the raylet's helpers). A busy
 # machine may exceed them, but rarely twice in a row.
 RUNTIME_TRIES = 3
@@ -24,7 +25,8 @@ def run_simulation(config: Config, *, timeout_s: float = 24 * 3600.0) -> Path:
     """
     config = check(replace(absolute(config), num_threads=config.num_threads or 1))
     before = run_folders(config)
-    with tempfile.TemporaryDirectory(prefix="fedvla-flower-") as folder:
+    guard.clear(HOME)
+    with tempfile.TemporaryDirectory(prefix=HOME) as folder:
         app = app_bundle.stage_app(Path(folder), config)
         with local_superlink(Path(folder), "--simulation") as link:
             federation = f"num-supernodes={config.num_clients} client-resources-num-cpus=1"

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fedvla_lib.engines.credentials import ServerFiles
+from fedvla_lib.engines.guard import guarded
 from fedvla_lib.engines.processes import FlowerRunError, free_port, one_line, reason, start, stop, wait_until
 from fedvla_lib.engines.warm_start import ray_python, warm_start
 
@@ -89,6 +90,8 @@ class SuperLink:
 def local_superlink(home: Path, *options: str, files: ServerFiles | None = None) -> Iterator[SuperLink]:
     """Start a SuperLink on a free port of this machine, with `home` as FLWR_HOME, and stop it at the end.
 
+    If this process is killed, all that was started with that home ends too.
+
     Args:
         options: of ``flower-superlink``, such as ``--simulation``.
         files: certificates; without them the connection is not encrypted.
@@ -105,7 +108,7 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
         protection = ["--ssl-ca-certfile", str(files.authority), "--ssl-certfile", str(files.certificate)]
         protection += ["--ssl-keyfile", str(files.key)]
     command = ["flower-superlink", *protection, *options, "--host", "127.0.0.1", "--port", str(port)]
-    with warm_start(flower_environment(home), home / "fork_server.log") as environment:
+    with guarded(home), warm_start(flower_environment(home), home / "fork_server.log") as environment:
         process = start(command, environment, log := home / "superlink.log")
         try:
             wait_until(lambda: answers(port, files), process, log, "the SuperLink")

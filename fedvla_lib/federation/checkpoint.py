@@ -50,15 +50,15 @@ def save(root: Path, checkpoint: Checkpoint) -> None:
                 save_file(arrays, draft / name, metadata={HASH: digest(arrays)})
             except SafetensorError as error:  # of a full disk
                 raise OSError(f"cannot write {folder / name}: {error}") from error
-    for old in sorted(_rounds(root))[:-KEPT]:
+    for old in rounds(root)[:-KEPT]:
         shutil.rmtree(root / "checkpoints" / f"round_{old}")
 
 
 def load(root: Path) -> Checkpoint:
     """Return a run's last intact checkpoint, warning of each damaged one after it; raise ValueError if none is left."""
-    if not (rounds := sorted(_rounds(root), reverse=True)):
+    if not (found := rounds(root)):
         raise ValueError(f"{root} has no checkpoint: no round was completed; start a new run")
-    for number in rounds:
+    for number in reversed(found):
         folder = root / "checkpoints" / f"round_{number}"
         try:
             return Checkpoint(number, **{part: _read(folder / f"{part}.safetensors") for part in PARTS})
@@ -89,6 +89,7 @@ def nested(arrays: Arrays) -> dict[str, Arrays]:
     return tree
 
 
-def _rounds(root: Path) -> list[int]:
+def rounds(root: Path) -> list[int]:
+    """Return the rounds that have a checkpoint, in order."""
     found = [NAME.fullmatch(path.name) for path in (root / "checkpoints").glob("round_*")]
-    return [int(match[1]) for match in found if match]
+    return sorted(int(match[1]) for match in found if match)

@@ -31,6 +31,7 @@ from fedvla_lib.robot.tasks import check_tasks
 from fedvla_lib.run_folder import GLOBAL, RunFolder
 
 CONNECT_TIMEOUT_S = 60.0  # for all clients to connect
+BEFORE_ALL = -1  # the round before round 0
 
 
 @runtime_checkable
@@ -75,7 +76,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     states = grid if isinstance(grid, ClientStates) else None
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
-    roster = _introduce(grid, config, run)
+    roster = _introduce(grid, config, run, again=saved is not None)
     asked = normalisation.asks_clients(config)
     pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes]) if asked else {}
     stats = normalisation.common_statistics(config, pooled)
@@ -101,7 +102,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
         timeout=config.round_timeout_s,
         train_config=ConfigRecord({messages.STATS: packed}),
         evaluate_config=ConfigRecord({messages.STATS: packed}),
-        evaluate_fn=RoundEnd(config, store, bundle, run, strategy, states, progress, jobs),
+        evaluate_fn=RoundEnd(config, store, bundle, run, strategy, states, saved is not None, progress, jobs),
     )
 
 
@@ -118,12 +119,13 @@ class RoundEnd:
     run: RunFolder
     strategy: Checked
     states: ClientStates | None
+    resumed: bool
     progress: bool
     jobs: int
 
     def __call__(self, flower_round: int, record: ArrayRecord) -> MetricRecord | None:
         """End a round, unless an earlier process already did."""
-        if self.strategy.rounds_done and flower_round == 0:
+        if self.resumed and flower_round == 0:
             return None
         number, arrays = self.strategy.rounds_done + flower_round, messages.unpack_arrays(record)
         measured = self._evaluate(number, arrays) if measure.is_validated(self.config, number) else {}
@@ -154,9 +156,11 @@ class RoundEnd:
 
 
 def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
-    """Return the checkpoint to resume from, and remove what was written of later rounds."""
+    """Return the checkpoint to resume from, if there is one, and remove what was written of later rounds."""
     if not config.resume:
         return None
+    if not checkpoint.rounds(run.root):  # it ended before the end of round 0, and begins again
+        return run_folder.forget_after(run.root, BEFORE_ALL)
     keeps_state = {
         f"strategy={config.strategy}": config.strategy == "scaffold", "keep-optimizer": config.keep_optimizer,
         f"exchange={config.exchange}": config.exchange != "float32", "personal": config.personal,
@@ -175,8 +179,12 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     return found
 
 
-def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
-    """Ask clients for partition, frame count and statistics; none of their other data leaves them."""
+def _introduce(grid: Grid, config: Config, run: RunFolder, again: bool) -> Roster:
+    """Ask clients for partition, frame count and statistics; none of their other data leaves them.
+
+    Args:
+        again: they introduced themselves to an earlier process of this run, which logged it.
+    """
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
     asked = {"needs_stats": normalisation.asks_clients(config)}
     if privacy.weighs_alike(config):
@@ -187,7 +195,7 @@ def _introduce(grid: Grid, config: Config, run: RunFolder) -> Roster:
             f"{len(roster.nodes)} of {len(nodes)} clients could be used, min-replies={config.min_replies} are "
             "required; the rejected ones are in metrics.jsonl"
         )
-    for node in roster.nodes if not config.resume else []:
+    for node in roster.nodes if not again else []:
         run.log(0, roster.name(node), "data", {"num_examples": roster.examples_of[node]})
     return roster
 

@@ -85,7 +85,12 @@ class Checked:
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
-        """Aggregate the valid replies; raise TooFewReplies if there are fewer than `min_replies`."""
+        """Aggregate the valid replies.
+
+        Raises:
+            TooFewReplies: there are fewer than `min_replies`.
+            FloatingPointError: the new global arrays, or what the strategy keeps, are not finite.
+        """
         server_round += self.rounds_done
         valid = self._valid(server_round, "train", replies, self._check_train)
         if len(valid) < self.config.min_replies:
@@ -101,7 +106,9 @@ class Checked:
         self._before_aggregation(valid)
         arrays, metrics = super().aggregate_train(server_round, valid)
         # Flower's adaptive strategies compute in float64.
-        return ArrayRecord({n: Array(np.asarray(a.numpy(), np.float32)) for n, a in arrays.items()}), metrics
+        model = {name: np.asarray(array.numpy(), np.float32) for name, array in arrays.items()}
+        _require_finite(server_round, {messages.ARRAYS: model, **self.state()})
+        return ArrayRecord({name: Array(array) for name, array in model.items()}), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the valid replies of clients that have held-out episodes."""
@@ -259,6 +266,17 @@ class Checked:
         for record in extra:
             messages.checked_arrays(reply.content, messages.NOTE, self.shapes, record, (messages.ARRAYS, *extra))
         self._arrived[reply.metadata.src_node_id] = arrays
+
+
+def _require_finite(server_round: int, state: dict[str, Arrays]) -> None:
+    """Raise FloatingPointError if the average, or what the strategy keeps, overflowed; all replies were finite."""
+    for record, arrays in state.items():
+        for name, array in arrays.items():
+            if not np.isfinite(array).all():
+                raise FloatingPointError(
+                    f"round {server_round}: the average overflowed ({record} of {name!r} is not finite): "
+                    "lower lr or server-lr; the last checkpoint is of the round before"
+                )
 
 
 def _check_evaluate(reply: Message) -> None:
