@@ -33,6 +33,7 @@ class Config:
     sampling: str = "uniform"  # who trains in a round: uniform, or by-task (the tasks that clients announce take turns)
     fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
     min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
+    frames_cap: float = 10.0  # a client counts for at most this many times the median number of frames; 0: no limit
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, diloco, fedexp, fedmedian, krum or scaffold
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
@@ -157,6 +158,7 @@ def check(config: Config) -> Config:
     non_negative = (
         "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
         "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious", "alone_steps", "noise", "epsilon_budget",
+        "frames_cap",
     )  # fmt: skip
     for name in non_negative:
         _require(getattr(config, name) >= 0, config, name, "0 or more")

@@ -11,7 +11,7 @@ from lerobot.datasets import LeRobotDataset
 from fedvla_lib.config import from_profile
 from fedvla_lib.data.batches import Batches, batch_of_rows, frame_rows
 from fedvla_lib.data.frame_store import open_store
-from fedvla_lib.data.normalisation import episode_stats, pool_stats
+from fedvla_lib.data.normalisation import episode_stats, implausible, pool_stats
 from fedvla_lib.data.recordings import resolve
 from fedvla_lib.data.splits import split
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
@@ -80,10 +80,16 @@ def test_statistics_are_of_the_given_episodes_only(store):
 
 @pytest.mark.integration
 @pytest.mark.parametrize(
-    "clients", [[[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]], [[0], [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]]]
+    "clients",
+    [
+        [[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]],
+        [[0], [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]],
+        [[i] for i in range(12)],
+    ],
 )
 def test_pooled_client_statistics_are_those_of_the_pooled_episodes(store, clients):
     pooled = pool_stats([episode_stats(store, ids) for ids in clients])
+    assert not any(implausible([episode_stats(store, ids) for ids in clients]))  # few episodes, different tasks
     whole = episode_stats(store, [episode_id for ids in clients for episode_id in ids])
     for key in (STATE_KEY, ACTION_KEY):
         for name in ("mean", "std", "min", "max", "count"):

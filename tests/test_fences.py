@@ -50,7 +50,8 @@ FENCES = {
     },
     "transformers": {"policy.prefix_cache"},
     "flwr": {
-        "federation.client_app", "federation.messages", "federation.nodes", "federation.server_app",
+        "federation.client_app", "federation.messages", "federation.nodes", "federation.rollout_replies",
+        "federation.server_app",
         "federation.secure_aggregation", "federation.secure_round", "federation.throttled_grid", STRATEGIES,
         "engines.inline",
     },
@@ -213,7 +214,7 @@ def test_files_and_functions_stay_small():
 
 def test_the_library_stays_small():
     files = [*(ROOT / "fedvla_lib").rglob("*.py")]
-    assert sum(len(file.read_text().splitlines()) for file in files) <= 11_100
+    assert sum(len(file.read_text().splitlines()) for file in files) <= 11_300
 
 
 def test_the_flower_app_has_every_setting_with_its_default():

@@ -13,6 +13,7 @@ from flwr.clientapp import ClientApp
 from fedvla_lib.config import Config
 from fedvla_lib.data import normalisation
 from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid, claim_identity
+from fedvla_lib.evaluation.video import encode_video
 from fedvla_lib.federation.messages import (
     ARRAYS,
     CONFIG,
@@ -24,9 +25,9 @@ from fedvla_lib.federation.messages import (
     make_note,
     pack_arrays,
     unpack_arrays,
-    unpack_rollouts,
 )
-from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
+from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, plain, wait_for_nodes
+from fedvla_lib.federation.rollout_replies import unpack_rollouts
 from fedvla_lib.federation.strategies import build
 from fedvla_lib.policy.parameters import ParameterError, digest, shapes_of
 
@@ -82,9 +83,10 @@ def one_round(
     events = Events()
     grid = InlineGrid(app, num_clients, {})
     nodes = grid.get_node_ids()
-    examples_of = dict.fromkeys(nodes, announced) if announced else {}
-    roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of)
+    announced = [announced] * num_clients if isinstance(announced, int) else announced
     config = Config(**{"fraction_train": 1.0, **settings})
+    examples_of = dict(zip(nodes, announced or [], strict=bool(announced)))
+    roster = Roster({node: node - FIRST_NODE_ID for node in nodes}, examples_of, frames_cap=config.frames_cap)
     strategy = build.build_strategy(
         config, roster=roster, shapes=shapes, report=events.log,
         keep_rollouts=lambda *_: None,
@@ -298,6 +300,21 @@ def test_a_client_cannot_buy_weight_with_more_examples_than_it_came_with():
     np.testing.assert_allclose(averaged["weight"], expected, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("cap", [0.0, 10.0], ids=["no limit", "ten times the median"])
+def test_a_client_that_announces_more_frames_than_anyone_has_counts_for_a_limited_number(cap):
+    frames = [8, 10, 12, 2**40]
+    app = answering(lambda k, _: reply_content(random_arrays(k), frames[k]))
+    averaged, _, _ = one_round(app, 4, announced=frames, frames_cap=cap)
+    weights = [8, 10, 12, 110 if cap else 2**40]  # the median is 11
+    wanted = np.average([random_arrays(k)["weight"] for k in range(4)], axis=0, weights=weights)
+    np.testing.assert_allclose(averaged["weight"], wanted, rtol=1e-5, atol=1e-6)
+
+
+def test_the_cap_on_frames_does_not_bind_clients_that_differ_as_labs_do():
+    roster = Roster({k: k for k in range(4)}, {0: 20, 1: 100, 2: 140, 3: 900}, frames_cap=Config().frames_cap)
+    assert [roster.weight(k) for k in range(4)] == [20, 100, 140, 900]
+
+
 def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
     """A client that announces a billion frames from the start and sends an update in the opposite direction."""
     start, wanted = random_arrays(99), random_arrays(98)
@@ -485,6 +502,8 @@ INTRODUCTIONS = {
     "words": ("statistics", {"stats": _action(mean=["a lot"] * 6)}),
     "a mean out of range": ("statistics", {"stats": _action(mean=[7.0] * 6)}),
     "min above max": ("statistics", {"stats": _action(min=[2.0] * 6)}),
+    "beyond what the arm can do": ("statistics", {"stats": _action(max=[1e5] * 6, std=[5e4] * 6)}),
+    "a spread beyond its range": ("statistics", {"stats": _action(std=[1.1] * 6)}),
     "negative count": ("examples", {"stats": _action(count=[-6])}),
     "half a frame": ("statistics", {"stats": _action(count=[6.5])}),
     "a count beyond 64 bits": ("statistics", {"stats": _action(count=[10**30])}),
@@ -495,6 +514,7 @@ INTRODUCTIONS = {
     "more frames than anyone has": ("examples", {"num_examples": 2**62}),
     "frames that are true": ("examples", {"num_examples": True}),
     "negative partition": ("partition", {"partition_id": -1}),
+    "a partition that there is not": ("partition", {"partition_id": 3}),
     "a partition that is true": ("partition", {"partition_id": True}),
     "one task as text": ("tasks", {"tasks": "lift"}),
     "tasks that are numbers": ("tasks", {"tasks": [1, 2]}),
@@ -507,7 +527,7 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     reason, said = INTRODUCTIONS[fault]
     events = Events()
     grid = InlineGrid(introducing([0, 1, 2], **said), 3, {})
-    roster = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
+    roster = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0, num_clients=3)
     kept = [FIRST_NODE_ID, FIRST_NODE_ID + 2]
     assert roster.nodes == kept and roster.partition_of == dict(zip(kept, [0, 2], strict=True))
     assert sorted(roster.stats_of) == sorted(roster.examples_of) == kept
@@ -519,7 +539,30 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     np.testing.assert_array_equal(pooled["action"]["std"], np.ones(6))
 
 
-@pytest.mark.parametrize("value", [0.1, -7e-30, 1e30])
+def test_statistics_unlike_those_of_all_others_are_left_out_of_the_pool_by_name():
+    """What stays is pooled exactly; a liar's count is capped too, so that it does not own the pool."""
+    wide = {"min": -300.0 * np.ones(6), "max": 300.0 * np.ones(6)}
+    events, frames = Events(), [10, 20, 30, 40]
+    stats = [statistics(n, mean=np.full(6, k / 10)) for k, n in enumerate(frames)]
+    honest = Roster({k: k for k in range(4)}, dict(enumerate(frames)), dict(enumerate(stats)))
+    pooled = normalisation.pool_stats(honest.plausible_stats(events.log))
+    assert not events
+    np.testing.assert_array_equal(pooled["action"]["mean"], normalisation.pool_stats(stats)["action"]["mean"])
+    for lie in ({"std": np.full(6, 200.0), **wide}, {"mean": np.full(6, 290.0), **wide}):
+        roster = Roster(honest.partition_of, honest.examples_of, honest.stats_of | {2: statistics(30, **lie)})
+        kept = normalisation.pool_stats(roster.plausible_stats(events.log))
+        assert events.rejected() == {"client_2": "statistics"}
+        assert kept["action"]["count"] == 70 and kept["action"]["std"].max() < 1.1
+    capped = Roster(honest.partition_of, honest.examples_of | {1: 2**40}, honest.stats_of, frames_cap=2.0)
+    assert normalisation.pool_stats(capped.plausible_stats(events.log))["action"]["count"] == 10 + 70 + 30 + 40
+
+
+def test_what_a_client_says_is_logged_as_one_short_line_without_control_characters():
+    said = plain("no\x1b[2J\n space \u202e" + "x" * 10**6)
+    assert said.isprintable() and said.startswith("no [2J space x") and len(said) == 1000
+
+
+@pytest.mark.parametrize("value", [0.1, -7e-30, 300.0])
 def test_joints_that_never_move_can_be_pooled(value):
     """Through rounding, the mean of equal numbers can lie outside their range."""
 
@@ -546,23 +589,62 @@ def test_missing_clients_are_named_with_the_remedy():
         wait_for_nodes(grid, 3, 0.1)
 
 
-@pytest.mark.parametrize("name", ["../evil.mp4", "rollout_1.py", "/tmp/rollout_1.mp4", "rollout_a/b.mp4"])
-def test_a_client_cannot_choose_where_the_server_writes(name):
-    note = make_note(rollouts="[]", file_names=[name], files=[b"x"])
-    with pytest.raises(ValueError, match="expected files rollout_"):
-        unpack_rollouts(RecordDict({NOTE: note}))
+STEPS_TAKEN = 3
 
 
-@pytest.mark.parametrize(
-    "said",
-    [
-        {"rollouts": "[" * 100_000}, {"rollouts": '[{"video": "rollout_1.mp4", "rows": [[]]}]'}, {"rollouts": "[3]"},
-        {"file_names": [3]}, {"file_names": 3}, {"file_names": [f"rollout_{'x' * 300}.mp4"]}, {"files": ["text"]},
-    ],
-    ids=["too deep", "nested", "numbers", "numbered files", "a number", "longer than a file's name", "text for bytes"],
-)  # fmt: skip
-def test_rollouts_that_cannot_be_kept_are_refused(said):
-    good = {"rollouts": '[{"video": "rollout_1.mp4"}]', "file_names": ["rollout_1.mp4"], "files": [b"x"]}
-    unpack_rollouts(RecordDict({NOTE: make_note(**good)}))
-    with pytest.raises(ParameterError, match="rollout"):
-        unpack_rollouts(RecordDict({NOTE: make_note(**good | said)}))
+def rolled_out(steps=STEPS_TAKEN, file="rollout_1", film=None, arrays=None, **said):
+    """The note of a client with one rollout; `said` replaces what its row says."""
+    row = {
+        "task": "lift", "instruction": "Lift the cube.", "lab": "lab_0", "seed": 7, "success": False, "steps": steps,
+        "completion_time_s": float("nan"), "action_smoothness": 0.5, "video": f"{file}.mp4",
+    }  # fmt: skip
+    trajectory = io.BytesIO()
+    joints = np.zeros((STEPS_TAKEN, 6), np.float32)
+    np.savez(trajectory, **(arrays or {"states": joints, "actions": joints, "success": False, "seed": 7}))
+    film = encode_video(np.zeros((STEPS_TAKEN, 16, 32, 3), np.uint8)) if film is None else film
+    names, files = [f"{file}.mp4", f"{file}.npz"], [film, trajectory.getvalue()]
+    return {"rollouts": json.dumps([row | said]), "file_names": names, "files": files}
+
+
+def unpacked(note, most=1, tasks=("lift", "push")):
+    return unpack_rollouts(RecordDict({NOTE: make_note(**note)}), tasks, most)
+
+
+def test_rollouts_arrive_as_they_were_sent():
+    rows, files = unpacked(rolled_out())
+    assert rows[0]["task"] == "lift" and np.isnan(rows[0]["completion_time_s"]) and len(files) == 2
+    assert unpacked({"rollouts": "[]", "file_names": [], "files": []}, most=0) == ([], {})
+
+
+BOMB = {"states": np.zeros(10_000_000), "actions": np.zeros((STEPS_TAKEN, 6)), "success": False, "seed": 7}
+ROLLOUTS = {
+    "an event of another": lambda: rolled_out(who="global"), "a round": lambda: rolled_out(round=3),
+    "success in words": lambda: rolled_out(success="yes"), "a seed beyond 64 bits": lambda: rolled_out(seed=10**300),
+    "no steps": lambda: rolled_out(steps=0), "more steps than the film": lambda: rolled_out(steps=4),
+    "infinite": lambda: rolled_out(action_smoothness=float("inf")),
+    "another task": lambda: rolled_out(task="juggle"), "a book": lambda: rolled_out(instruction="lift" * 999),
+    "no film": lambda: rolled_out(film=b"x" * 1000), "an empty film": lambda: rolled_out(film=b""),
+    "huge": lambda: rolled_out(film=bytes(20_000_001)),
+    "text for bytes": lambda: rolled_out() | {"files": ["text", "text"]},
+    "a trajectory that unpacks": lambda: rolled_out(arrays=BOMB),
+    "code": lambda: rolled_out(arrays=BOMB | {"states": np.array([{}], dtype=object)}),
+    "elsewhere": lambda: rolled_out(file="../evil"), "a long name": lambda: rolled_out(file=f"rollout_{'x' * 300}"),
+    "another's file": lambda: rolled_out(video="rollout_2.mp4"),
+    "too deep": lambda: rolled_out() | {"rollouts": "[" * 100_000},
+    "numbers": lambda: rolled_out() | {"rollouts": "[3]"},
+    "numbered files": lambda: rolled_out() | {"file_names": [3, 4]},
+    "one file": lambda: rolled_out() | {"files": [b"x"]},
+    "files only": lambda: rolled_out() | {"rollouts": "[]"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", ROLLOUTS)
+def test_rollouts_that_no_client_was_asked_for_are_refused_in_a_line(fault):
+    with pytest.raises(ParameterError, match="rollout|film") as caught:
+        unpacked(ROLLOUTS[fault]())
+    assert caught.value.kind == "rollouts"
+
+
+def test_more_rollouts_than_asked_for_are_refused():
+    with pytest.raises(ParameterError, match="1 rollouts, expected at most 0"):
+        unpacked(rolled_out(), most=0)

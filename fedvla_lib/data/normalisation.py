@@ -10,7 +10,10 @@ from fedvla_lib.config import Config
 from fedvla_lib.data.batches import frame_rows
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.data.splits import held_out_episodes
-from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
+from fedvla_lib.robot.spec import ACTION_KEY, JOINT_NAMES, NUM_JOINTS, STATE_KEY
+
+FAR = 4.0  # usual spreads; single episodes of different tasks are within three
+LEAST_SPREAD = 30.0  # degrees, or percent of the gripper: one task turns the wrist by 90 that others hardly move
 
 Stats = dict[str, dict[str, np.ndarray]]  # feature key -> mean, std, min, max, count
 
@@ -32,6 +35,25 @@ def pool_stats(stats: Sequence[Stats]) -> Stats:
     sum(n_k (s_k^2 + (m_k - m)^2)) / sum(n_k); this is exact (LeRobot's `aggregate_stats`).
     """
     return aggregate_stats(list(stats))
+
+
+def implausible(stats: Sequence[Stats]) -> list[str]:
+    """Return for each client what of its statistics is implausible beside those of the others, or "".
+
+    That is a mean further from the median of all means than `FAR` usual spreads, or a spread as large. Of less than
+    three clients none can be called the odd one out, and nothing helps once most of them lie.
+    """
+    reasons = [""] * len(stats)
+    for key in (STATE_KEY, ACTION_KEY) if len(stats) > 2 else ():
+        means, stds = (np.stack([of[key][name] for of in stats]) for name in ("mean", "std"))
+        limit = FAR * np.maximum(np.median(stds, axis=0), LEAST_SPREAD)
+        far = (np.abs(means - np.median(means, axis=0)) > limit) | (stds > limit)
+        for client, joints in enumerate(far):
+            if joints.any():
+                joint = int(joints.argmax())
+                found = f"mean {means[client, joint]:.4g}, std {stds[client, joint]:.4g}"
+                reasons[client] = f"{key} of {JOINT_NAMES[joint]} has {found}, unlike the other clients"
+    return reasons
 
 
 def _describe(values: np.ndarray) -> dict[str, np.ndarray]:

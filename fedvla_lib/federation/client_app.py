@@ -19,7 +19,7 @@ from flwr.clientapp.typing import Mod
 from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import measure
-from fedvla_lib.federation import accountant, messages, privacy, secure_round
+from fedvla_lib.federation import accountant, messages, privacy, rollout_replies, secure_round
 from fedvla_lib.federation.client import LOADERS, WORKER_LOADERS, Client, Loaders, open_client
 from fedvla_lib.federation.quantisation import DOWNWARD, with_feedback
 from fedvla_lib.federation.strategies.fedprox import Proximal
@@ -111,7 +111,7 @@ def _evaluated(client: Client, bundle: Bundle, round_number: int) -> RecordDict:
     examples, metrics = client.validate(bundle)
     with tempfile.TemporaryDirectory() as folder:
         due = measure.rolls_out(client.config, round_number)
-        rollouts = messages.pack_rollouts(client.roll_out(bundle, Path(folder)) if due else [], Path(folder))
+        rollouts = rollout_replies.pack_rollouts(client.roll_out(bundle, Path(folder)) if due else [], Path(folder))
     return RecordDict({
         messages.METRICS: MetricRecord({messages.EXAMPLES: examples, **metrics}), messages.NOTE: rollouts,
     })  # fmt: skip

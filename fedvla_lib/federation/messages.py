@@ -7,11 +7,8 @@ like the arrays.
 """
 
 import io
-import json
 import math
-import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +19,6 @@ from fedvla_lib.federation.quantisation import check_encoded, decode
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_arrays, check_digest, digest
 from fedvla_lib.robot.spec import JOINT_NAMES
 
-# Rows, one per rollout, as from `rollouts.evaluate` with file names as videos; and the files (mp4, npz) by name.
-Rollouts = tuple[list[dict[str, Any]], dict[str, bytes]]
 ARRAYS, CONFIG, METRICS, NOTE = "arrays", "config", "metrics", "note"  # records
 CONTROL, SECOND_MOMENTS = EXTRA = "control", "second_moments"  # records of arrays that some settings add
 
@@ -35,7 +30,6 @@ PROXIMAL_MU = "proximal-mu"  # Flower's own key
 DATA = "data"  # in a node's config: the client's own data set
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"
-ROLLOUT_NAME = re.compile(r"rollout_\w{1,200}\.(mp4|npz)", re.ASCII)  # short enough for any file system
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 # Exactly the numbers of a reply: Flower only averages records with equal keys.
@@ -118,37 +112,6 @@ def count_bytes(content: RecordDict) -> int:
     # Flower's `ConfigRecord.count_bytes` fails on an empty list or text.
     rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
     return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
-
-
-def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
-    """Return rows and the files of `folder` as a note, so that they reach the server on every engine."""
-    files = sorted(folder.iterdir())
-    rollouts = json.dumps([{**row, "video": Path(row["video"]).name} for row in rows])
-    return make_note(rollouts=rollouts, file_names=[f.name for f in files], files=[f.read_bytes() for f in files])
-
-
-def unpack_rollouts(content: RecordDict) -> Rollouts:
-    """Return the rollouts of an evaluation reply.
-
-    Raises:
-        ParameterError: they cannot be read, or a file name is not a rollout's, so that a client cannot choose where the
-            server writes.
-    """
-    note = content.config_records.get(NOTE, {})
-    try:
-        rows = json.loads(note["rollouts"])
-        files = dict(zip(note["file-names"], note["files"], strict=True))
-        flat = not any(isinstance(value, dict | list) for row in rows for value in row.values())
-        usable = flat and all(row["video"] in files for row in rows)
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise ParameterError("rollouts", f"rollouts cannot be read: {error!r}") from error
-    bad = [
-        name for name, file in files.items()
-        if not isinstance(name, str) or not ROLLOUT_NAME.fullmatch(name) or not isinstance(file, bytes)
-    ]  # fmt: skip
-    if bad or not usable:
-        raise ParameterError("rollouts", f"expected files rollout_<timestamp>....mp4 or .npz, got {sorted(files)}")
-    return rows, files
 
 
 def make_note(**values: Any) -> ConfigRecord:

@@ -10,7 +10,7 @@ import numpy as np
 from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
-from fedvla_lib.data.normalisation import Stats, unpack_stats
+from fedvla_lib.data.normalisation import Stats, implausible, unpack_stats
 from fedvla_lib.federation.messages import NOTE
 from fedvla_lib.policy.parameters import ParameterError
 from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
@@ -20,8 +20,8 @@ Report = Callable[[int, str, str, dict[str, Any]], None]
 
 MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # -> length
 MOST_FRAMES = 2**40  # keeps the sum of all counts in 64 bits; it does not protect against a client that lies
-LARGEST = float(np.finfo(np.float32).max)  # policies normalise in float32; its square is still finite in float64
-LONGEST = 1000  # characters of the name of a task
+FURTHEST = 360.0  # degrees, or percent of the gripper: no joint of the arm gets as far
+LONGEST = 1000  # characters of the name of a task, and of a reason
 ROUNDING = 1e-6  # relative: how far a mean may lie outside its range
 
 
@@ -39,6 +39,8 @@ class Roster:
     tasks_of: dict[int, tuple[str, ...]] = field(default_factory=dict)
     needs_stats: bool = True  # else statistics that a client sends are not looked at
     most_frames: int = MOST_FRAMES  # 1 if all clients count alike
+    num_clients: int = MOST_FRAMES  # partitions that there are
+    frames_cap: float = 0.0  # see `Config`
 
     @property
     def nodes(self) -> list[int]:
@@ -48,6 +50,23 @@ class Roster:
     def name(self, node_id: int) -> str:
         """Return the client's name: ``client_3`` holds partition 3."""
         return client_name(self.partition_of[node_id])
+
+    def weight(self, node_id: int) -> int:
+        """Return the frames that a client counts for: those announced, or `frames_cap` times the median if fewer."""
+        announced = self.examples_of[node_id]
+        cap = self.frames_cap * float(np.median(list(self.examples_of.values())))
+        return min(announced, max(1, round(cap))) if cap else announced
+
+    def plausible_stats(self, report: Report) -> list[Stats]:
+        """Return the clients' statistics in the order of partitions, less those that others make implausible."""
+        reasons = dict(zip(self.nodes, implausible([self.stats_of[node] for node in self.nodes]), strict=True))
+        for node, reason in reasons.items():
+            if reason:
+                values = {"to": "query", "reason": "statistics", "detail": f"left out of the pool: {reason}"}
+                report(0, self.name(node), "rejected", values)
+        kept = [node for node, reason in reasons.items() if not reason]
+        counted = {node: {"count": np.array([self.weight(node)])} for node in kept}
+        return [{key: of | counted[node] for key, of in self.stats_of[node].items()} for node in kept]
 
     def sample(self, share: float, rng: np.random.Generator, by_task: bool = False) -> list[int]:
         """Sample a share of the clients without replacement: `sample_size` node ids, ordered by partition.
@@ -73,8 +92,11 @@ class Roster:
         node, note = reply.metadata.src_node_id, answered(reply).content.config_records.get(NOTE, {})
         partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
         taken = self.partition_of.values()
-        if type(partition_id) is not int or partition_id < 0 or partition_id in taken:  # True is an int as well
-            raise ParameterError("partition", f"partition-id={partition_id!r} is missing or held by another node")
+        if type(partition_id) is not int or not 0 <= partition_id < self.num_clients:  # True is an int as well
+            text = f"partition-id={partition_id!r}: expected a number from 0, below num-clients={self.num_clients}"
+            raise ParameterError("partition", text)
+        if partition_id in taken:
+            raise ParameterError("partition", f"partition-id={partition_id!r} is held by another node")
         if type(num_examples) is not int or not 0 < num_examples <= self.most_frames:
             text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
             raise ParameterError("examples", f"{text} and at most {self.most_frames}")
@@ -124,9 +146,15 @@ def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: flo
         try:
             roster.add(reply)
         except ParameterError as error:
-            values = {"to": "query", "reason": error.kind, "detail": str(error)}
+            values = {"to": "query", "reason": error.kind, "detail": plain(str(error))}
             report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
     return roster
+
+
+def plain(text: str) -> str:
+    """Return what a client said as one short line without control characters, for terminals and logs."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * LONGEST]).split())
+    return words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."
 
 
 def answered(reply: Message | None) -> Message:
@@ -134,7 +162,7 @@ def answered(reply: Message | None) -> Message:
     if reply is None:
         raise ParameterError("silent", "no reply in time")
     if reply.has_error():
-        raise ParameterError("error", " ".join(str(reply.error.reason).split()) or f"error code {reply.error.code}")
+        raise ParameterError("error", plain(str(reply.error.reason)) or f"error code {reply.error.code}")
     return reply
 
 
@@ -168,11 +196,13 @@ def _check_measures(key: str, measures: dict[str, np.ndarray]) -> None:
         if value.dtype.kind != kind or value.shape != (length,):
             found = f"{value.dtype} {value.shape}"
             raise ParameterError("statistics", f"{key}.{name} is {found}, expected {length} numbers")
-        if not (np.abs(value) <= LARGEST).all():  # also false for NaN
-            raise ParameterError("statistics", f"{key}.{name} holds values that are not finite in float32")
+        if kind == "f" and not (np.abs(value) <= FURTHEST).all():  # also false for NaN
+            raise ParameterError("statistics", f"{key}.{name} is beyond what the arm can do, {FURTHEST:g}")
     mean, lowest, highest = measures["mean"], measures["min"], measures["max"]
     if (measures["std"] < 0).any():
         raise ParameterError("statistics", f"{key}.std is below 0")
     slack = ROUNDING * np.maximum(np.abs(lowest), np.abs(highest))
     if (lowest > highest).any() or (mean < lowest - slack).any() or (mean > highest + slack).any():
         raise ParameterError("statistics", f"{key}: a mean lies outside its min and max")
+    if (measures["std"] > (highest - lowest) / 2 + slack).any():  # Popoviciu's inequality
+        raise ParameterError("statistics", f"{key}: a std is above half the distance of min and max")

@@ -21,6 +21,7 @@ from fedvla_lib.federation.accountant import open_ledger
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.client import LOADERS, Loaders
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
+from fedvla_lib.federation.rollout_replies import Rollouts
 from fedvla_lib.federation.secure_round import SecureGrid
 from fedvla_lib.federation.strategies.build import build_strategy
 from fedvla_lib.federation.strategies.checked import Checked
@@ -77,8 +78,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     saved = _resume_from(config, run, states)
     store = loaders.open_frames(config)  # before any client does: they would all record the same data
     roster = _introduce(grid, config, run, again=saved is not None)
-    asked = normalisation.asks_clients(config)
-    pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes]) if asked else {}
+    pooled = normalisation.pool_stats(roster.plausible_stats(run.log)) if normalisation.asks_clients(config) else {}
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
     arrays, done = bundle.shared_arrays(), 0
@@ -186,7 +186,8 @@ def _introduce(grid: Grid, config: Config, run: RunFolder, again: bool) -> Roste
         again: they introduced themselves to an earlier process of this run, which logged it.
     """
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
-    asked = {"needs_stats": normalisation.asks_clients(config)}
+    asked = {"needs_stats": normalisation.asks_clients(config), "num_clients": config.num_clients}
+    asked["frames_cap"] = config.frames_cap
     if privacy.weighs_alike(config):
         asked["most_frames"] = 1
     roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s, **asked)
@@ -196,11 +197,12 @@ def _introduce(grid: Grid, config: Config, run: RunFolder, again: bool) -> Roste
             "required; the rejected ones are in metrics.jsonl"
         )
     for node in roster.nodes if not again else []:
-        run.log(0, roster.name(node), "data", {"num_examples": roster.examples_of[node]})
+        counted = {"num_examples": roster.examples_of[node], "counted": roster.weight(node)}
+        run.log(0, roster.name(node), "data", counted)
     return roster
 
 
-def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: messages.Rollouts) -> None:
+def _keep_rollouts(run: RunFolder, round_number: int, who: str, rollouts: Rollouts) -> None:
     """Write a client's videos and log its rollouts."""
     folder = run.videos_dir(round_number, who)
     rows, contents = rollouts

@@ -9,6 +9,7 @@ and the client drift.
 import logging
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,11 +18,13 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, Met
 from flwr.serverapp import Grid
 
 from fedvla_lib.config import Config
+from fedvla_lib.evaluation import measure
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation.accountant import Ledger
 from fedvla_lib.federation.drift import geometry
-from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered
+from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, plain
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
+from fedvla_lib.federation.rollout_replies import Rollouts, unpack_rollouts
 from fedvla_lib.policy.optimizers import SHARING
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
@@ -48,7 +51,7 @@ class Checked:
 
     def __init__(
         self, *, config: Config, roster: Roster, shapes: Shapes, report: Report,
-        keep_rollouts: Callable[[int, str, messages.Rollouts], None], rounds_done: int = 0, **flower: Any,
+        keep_rollouts: Callable[[int, str, Rollouts], None], rounds_done: int = 0, **flower: Any,
     ) -> None:  # fmt: skip
         super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
         self.config, self.roster, self.shapes = config, roster, shapes
@@ -63,6 +66,7 @@ class Checked:
         self._sent_bytes = 0
         self._global: Arrays = {}
         self._arrived: dict[int, Arrays] = {}  # in training replies, decoded, by node
+        self._rolled_out: dict[int, Rollouts] = {}  # in evaluation replies, by node
 
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
@@ -104,6 +108,10 @@ class Checked:
         if self.config.clip_norm or self.ledger:
             self._protect(server_round, valid)
         self._before_aggregation(valid)
+        for reply in valid:
+            if reply.metadata.src_node_id in self.roster.examples_of:
+                values = reply.content.metric_records[messages.METRICS]
+                values[messages.EXAMPLES] = self.roster.weight(reply.metadata.src_node_id)
         arrays, metrics = super().aggregate_train(server_round, valid)
         # Flower's adaptive strategies compute in float64.
         model = {name: np.asarray(array.numpy(), np.float32) for name, array in arrays.items()}
@@ -113,10 +121,10 @@ class Checked:
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Average the metrics of the valid replies of clients that have held-out episodes."""
         server_round += self.rounds_done
-        valid = self._valid(server_round, "evaluate", replies, _check_evaluate)
-        for reply in valid:
-            name = self.roster.name(reply.metadata.src_node_id)
-            self.keep_rollouts(server_round, name, messages.unpack_rollouts(reply.content))
+        due = self.config.client_rollouts if measure.rolls_out(self.config, server_round) else 0
+        valid = self._valid(server_round, "evaluate", replies, partial(self._check_evaluate, most=due))
+        for node in [reply.metadata.src_node_id for reply in valid]:
+            self.keep_rollouts(server_round, self.roster.name(node), self._rolled_out.pop(node))
         measured = [reply for reply in valid if _examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
 
@@ -213,7 +221,7 @@ class Checked:
 
     def _combined(self, record: str, arrived: dict[int, Arrays]) -> Arrays:
         """Return the new arrays of an extra record: the mean of the clients', weighted by training frames."""
-        frames, replies = [self.roster.examples_of[node] for node in arrived], list(arrived.values())
+        frames, replies = [self.roster.weight(node) for node in arrived], list(arrived.values())
         means = {name: np.average([reply[name] for reply in replies], 0, frames) for name in replies[0]}
         return {name: mean.astype(np.float32) for name, mean in means.items()}
 
@@ -234,10 +242,10 @@ class Checked:
             try:
                 check(answered(by_node.get(node)))
             except ParameterError as error:
-                name, reason = self.roster.name(node), error.kind
+                name, reason, detail = self.roster.name(node), error.kind, plain(str(error))
                 rejected.append(reason)
-                logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, reason, error)
-                self.report(server_round, name, "rejected", {"to": kind, "reason": reason, "detail": str(error)})
+                logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, reason, detail)
+                self.report(server_round, name, "rejected", {"to": kind, "reason": reason, "detail": detail})
             else:
                 valid.append(by_node[node])
                 values = by_node[node].content.metric_records[messages.METRICS]
@@ -267,6 +275,11 @@ class Checked:
             messages.checked_arrays(reply.content, messages.NOTE, self.shapes, record, (messages.ARRAYS, *extra))
         self._arrived[reply.metadata.src_node_id] = arrays
 
+    def _check_evaluate(self, reply: Message, most: int) -> None:
+        _check_metrics(reply, messages.EVALUATE_METRICS)
+        node = reply.metadata.src_node_id
+        self._rolled_out[node] = unpack_rollouts(reply.content, self.roster.tasks_of.get(node, ()), most)
+
 
 def _require_finite(server_round: int, state: dict[str, Arrays]) -> None:
     """Raise FloatingPointError if the average, or what the strategy keeps, overflowed; all replies were finite."""
@@ -277,11 +290,6 @@ def _require_finite(server_round: int, state: dict[str, Arrays]) -> None:
                     f"round {server_round}: the average overflowed ({record} of {name!r} is not finite): "
                     "lower lr or server-lr; the last checkpoint is of the round before"
                 )
-
-
-def _check_evaluate(reply: Message) -> None:
-    _check_metrics(reply, messages.EVALUATE_METRICS)
-    messages.unpack_rollouts(reply.content)
 
 
 def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:

@@ -67,8 +67,8 @@ class CheckedScaffold(Checked, FedAvg):
         """Add the clients' changes to c."""
         if record != messages.CONTROL:
             return super()._combined(record, arrived)
-        total, control = sum(self.roster.examples_of.values()), self.control
+        total, control = sum(map(self.roster.weight, self.roster.nodes)), self.control
         for node, change in arrived.items():
-            weight = np.float32(self.roster.examples_of[node] / total)
+            weight = np.float32(self.roster.weight(node) / total)
             control = {name: array + weight * change[name] for name, array in control.items()}
         return control
