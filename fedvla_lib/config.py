@@ -5,6 +5,7 @@ The same names, written with dashes, are the keys of ``[tool.flwr.app.config]`` 
 """
 
 import os
+import re
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ class Config:
     fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
     min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
     frames_cap: float = 10.0  # a client counts for at most this many times the median number of frames; 0: no limit
+    reply_limit_mb: float = 0.0  # largest reply of a client, in MB; 0: 100, and twice the arrays
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, diloco, fedexp, fedmedian, krum or scaffold
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
@@ -107,6 +109,23 @@ SAMPLINGS = ("uniform", "by-task")
 LOCAL_OPTIMIZERS = ("adamw", "sgd", "adamw-shared", "adamw-frozen")
 
 
+POSITIVE = {
+    "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
+    "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg", "validate_every",
+    "round_timeout_s",
+}  # fmt: skip
+MOST = {  # more is a slip of the keyboard, or takes more memory than there is
+    "episodes_per_task": 1e6, "image_size": 4096, "num_labs": 1000, "num_clients": 1e5, "num_server_rounds": 1e6,
+    "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
+    "round_timeout_s": 1e9, "server_lr": 1e6, "clip_norm": 1e9, "noise": 1e6,
+    "epsilon_budget": 1e6, "num_malicious": 1e5, "proximal_mu": 1e6, "dirichlet_alpha": 1e6, "chunk_size": 10_000,
+    "n_action_steps": 10_000, "lora_rank": 4096, "local_steps": 1e7, "batch_size": 65_536, "alone_steps": 1e9,
+    "lr": 1e9, "warmup_steps": 1e9, "checkpoint_every": 1e9, "validate_every": 1e9, "eval_every": 1e9,
+    "eval_rollouts": 1e6, "client_rollouts": 1e6, "action_tolerance_deg": 360, "seed": 2**63 - 1, "num_threads": 1024,
+}  # fmt: skip
+DEVICE = re.compile(r"cpu|mps|cuda(:\d{1,3})?")
+
+
 def from_profile(name: str | None = None, **overrides: Any) -> Config:
     """Return the settings of profile `name` (default: ``$FEDVLA_PROFILE``, else laptop), updated with `overrides`.
 
@@ -148,20 +167,10 @@ def granted_cores() -> int:
 
 def check(config: Config) -> Config:
     """Return `config`, or raise ValueError with the setting, its value and the valid range if a value is unusable."""
-    positive = (
-        "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
-        "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
-        "validate_every", "round_timeout_s",
-    )  # fmt: skip
-    for name in positive:
-        _require(getattr(config, name) > 0, config, name, "a number above 0")
-    non_negative = (
-        "warmup_steps", "checkpoint_every", "eval_every", "eval_rollouts", "client_rollouts", "num_threads", "seed",
-        "server_lr", "proximal_mu", "lora_rank", "clip_norm", "num_malicious", "alone_steps", "noise", "epsilon_budget",
-        "frames_cap",
-    )  # fmt: skip
-    for name in non_negative:
-        _require(getattr(config, name) >= 0, config, name, "0 or more")
+    for name, most in MOST.items():
+        value, least = getattr(config, name), "above 0" if name in POSITIVE else "from 0"
+        usable = 0 <= value <= most and (value > 0 or name not in POSITIVE)  # no comparison holds for NaN
+        _require(usable, config, name, f"a number {least}, at most {most:g}")
     for name in ("fraction_train", "fraction_evaluate", "val_fraction", "server_momentum", "clip_quantile", "delta"):
         _require(0 <= getattr(config, name) <= 1, config, name, "a number from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a number above 0")
@@ -177,7 +186,12 @@ def check(config: Config) -> Config:
     _require(whole, config, "num_labs", "a multiple of the number of tasks if each lab has one task")
     apart = not config.personal or not config.local_optimizer.startswith("adamw-")
     _require(apart, config, "local_optimizer", "adamw or sgd for a model with personal parts")
-    _require(bool(task_names(config)), config, "tasks", "task names separated by commas")
+    once = bool(task_names(config)) and len(set(task_names(config))) == len(task_names(config))
+    _require(once, config, "tasks", "task names separated by commas, each once")
+    _require(DEVICE.fullmatch(config.device) is not None, config, "device", "cpu, cuda, cuda:K or mps")
+    drawn = max(1, round(config.fraction_train * config.num_clients))
+    few = config.strategy != "krum" or 2 * config.num_malicious < drawn
+    _require(few, config, "num_malicious", f"less than half of the {drawn} clients of a round")
     _check_privacy(config)
     return config
 

@@ -56,6 +56,28 @@ def test_every_setting_is_a_flag_and_unset_flags_leave_the_profile_alone():
     assert settings(parser.parse_args(["train", "--no-freeze-vision-encoder"])).freeze_vision_encoder is False
 
 
+BEYOND = (
+    "lr=inf", "lr=nan", "lr=1e30", "clip-norm=inf", "dirichlet-alpha=inf", "chunk-size=100000000", "seed=10" + 29 * "0",
+    "num-threads=100000000", "num-clients=1000000", "warmup-steps=1" + 20 * "0", "lora-rank=1000000", "device=nope",
+    "tasks=lift,lift", "round-timeout-s=inf", "delta=2", "seed=-1",
+)  # fmt: skip
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("setting", BEYOND)
+def test_a_setting_beyond_its_limits_is_refused_in_one_line(setting, capsys):
+    name, value = setting.split("=")
+    assert main(["config", f"--{name}", value]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"fedvla config: {name}=") and "is not usable: give" in said and said.count("\n") == 1
+
+
+@pytest.mark.unit
+def test_more_malicious_clients_than_krum_can_withstand_are_refused(capsys):
+    assert main(["config", "--profile", "laptop", "--strategy", "krum", "--num-malicious", "50"]) == 2
+    assert "num-malicious=50 is not usable: give less than half of the 4 clients of a round" in capsys.readouterr().err
+
+
 @pytest.mark.unit
 @pytest.mark.parametrize(
     ("arguments", "said"),

@@ -302,7 +302,7 @@ def test_clients_really_add_the_noise(tiny, settings):
 @pytest.mark.integration
 def test_a_client_that_hides_its_update_keeps_the_reason_of_a_failure_for_itself(tiny, caplog):
     with pytest.raises(TooFewReplies):
-        inline.run_inline(replace(tiny, lr=1e30, noise_by="client", local_steps=4, min_replies=3), progress=False)
+        inline.run_inline(replace(tiny, lr=1e9, noise_by="client", local_steps=8, min_replies=3), progress=False)
     root = max(Path(tiny.out).glob("*/metrics.jsonl"), key=lambda file: file.stat().st_mtime).parent
     details = run_folder.read_metrics(root, "rejected").detail
     assert len(details) and details.str.contains("in its own log").all() and "loss is" in caplog.text

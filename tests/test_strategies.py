@@ -373,7 +373,7 @@ def test_a_client_that_does_not_reply_is_reported():
 
 @pytest.mark.parametrize(
     ("settings", "what"),
-    [({"strategy": "fedadam"}, "v_t of 'weight'"), ({"strategy": "fedavgm", "server_lr": 1e10}, "arrays of 'weight'")],
+    [({"strategy": "fedadam"}, "v_t of 'weight'"), ({"strategy": "fedavgm", "server_lr": 1e9}, "arrays of 'weight'")],
     ids=["in the state", "in the model"],
 )
 def test_an_average_that_overflows_ends_the_run_although_each_reply_is_finite(settings, what):
@@ -381,6 +381,18 @@ def test_an_average_that_overflows_ends_the_run_although_each_reply_is_finite(se
     huge = {name: np.full(shape, 1e30, np.float32) for name, shape in SHAPES.items()}
     with pytest.raises(FloatingPointError, match=f"round 4: the average overflowed .{what} is not finite"):
         one_round(answering(lambda k, _: reply_content(huge)), 2, server_round=4, **settings)
+
+
+def test_a_reply_larger_than_it_can_need_is_refused_before_anything_is_unpacked():
+    def huge(k, _):
+        content = reply_content(GOOD)
+        if k == 0:
+            content[NOTE]["film"] = bytes(3_000_000)
+        return content
+
+    _, _, events = one_round(answering(huge), 2, reply_limit_mb=2.0)
+    assert events.rejected() == {"client_0": "size"} and "3 MB, expected at most 2" in events[0][3]["detail"]
+    assert not one_round(answering(huge), 2)[2].rejected()
 
 
 def test_too_few_valid_replies_stop_the_run_with_a_clear_message():
@@ -518,6 +530,7 @@ INTRODUCTIONS = {
     "a partition that is true": ("partition", {"partition_id": True}),
     "one task as text": ("tasks", {"tasks": "lift"}),
     "tasks that are numbers": ("tasks", {"tasks": [1, 2]}),
+    "more than a note can need": ("size", {"stats": "x" * 2_000_000}),
     "a task as long as a book": ("tasks", {"tasks": ["lift" * 1000]}),
 }
 
@@ -533,7 +546,7 @@ def test_a_bad_introduction_is_refused_by_name_and_reason_and_the_rest_is_pooled
     assert sorted(roster.stats_of) == sorted(roster.examples_of) == kept
     assert events.rejected() == {f"node_{FIRST_NODE_ID + 1}": reason}
     detail = events[0][3]["detail"]
-    assert "\n" not in detail and (reason == "partition" or detail.startswith("client_1: "))
+    assert "\n" not in detail and (reason in ("partition", "size") or detail.startswith("client_1: "))
     pooled = normalisation.pool_stats([roster.stats_of[node] for node in roster.nodes])
     assert pooled["action"]["count"].tolist() == [5 + 7]
     np.testing.assert_array_equal(pooled["action"]["std"], np.ones(6))
@@ -573,6 +586,18 @@ def test_joints_that_never_move_can_be_pooled(value):
     events = Events()
     grid = InlineGrid(introducing(range(60), stats_of), 60, {})
     assert len(introduce_nodes(grid, wait_for_nodes(grid, 60, 1.0), events.log, 1.0).nodes) == 60 and not events
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_of_two_nodes_with_one_number_the_first_keeps_it_whatever_its_id(reverse, monkeypatch):
+    events, grid = Events(), InlineGrid(introducing([0, 1, 1]), 3, {})
+    replies = grid.send_and_receive
+    monkeypatch.setattr(grid, "send_and_receive", lambda *a, **k: replies(*a, **k)[:: -1 if reverse else 1])
+    roster = introduce_nodes(grid, wait_for_nodes(grid, 3, 1.0), events.log, 1.0)
+    second, third = FIRST_NODE_ID + 1, FIRST_NODE_ID + 2
+    kept, refused = (third, second) if reverse else (second, third)
+    assert roster.partition_of[kept] == 1 and events.rejected() == {f"node_{refused}": "partition"}
+    assert f"is held by node {kept}, the first" in events[0][3]["detail"]
 
 
 def test_introductions_are_ordered_by_partition_and_a_duplicate_is_rejected():

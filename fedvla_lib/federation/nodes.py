@@ -11,7 +11,7 @@ from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from fedvla_lib.data.normalisation import Stats, implausible, unpack_stats
-from fedvla_lib.federation.messages import NOTE
+from fedvla_lib.federation.messages import NOTE, count_bytes
 from fedvla_lib.policy.parameters import ParameterError
 from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
 
@@ -21,6 +21,7 @@ Report = Callable[[int, str, str, dict[str, Any]], None]
 MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # -> length
 MOST_FRAMES = 2**40  # keeps the sum of all counts in 64 bits; it does not protect against a client that lies
 FURTHEST = 360.0  # degrees, or percent of the gripper: no joint of the arm gets as far
+MOST_BYTES = 1e6  # of an introduction
 LONGEST = 1000  # characters of the name of a task, and of a reason
 ROUNDING = 1e-6  # relative: how far a mean may lie outside its range
 
@@ -89,14 +90,13 @@ class Roster:
 
     def add(self, reply: Message) -> None:
         """Add the client that introduces itself in `reply`; raise ParameterError if it cannot take part."""
-        node, note = reply.metadata.src_node_id, answered(reply).content.config_records.get(NOTE, {})
+        node, note = reply.metadata.src_node_id, reply.content.config_records.get(NOTE, {})
         partition_id, num_examples = note.get("partition-id"), note.get("num-examples")
-        taken = self.partition_of.values()
         if type(partition_id) is not int or not 0 <= partition_id < self.num_clients:  # True is an int as well
             text = f"partition-id={partition_id!r}: expected a number from 0, below num-clients={self.num_clients}"
             raise ParameterError("partition", text)
-        if partition_id in taken:
-            raise ParameterError("partition", f"partition-id={partition_id!r} is held by another node")
+        if holder := [other for other, taken in self.partition_of.items() if taken == partition_id]:
+            raise ParameterError("partition", f"partition-id={partition_id!r} is held by node {holder[0]}, the first")
         if type(num_examples) is not int or not 0 < num_examples <= self.most_frames:
             text = f"{client_name(partition_id)}: num-examples={num_examples!r}: expected training frames above 0"
             raise ParameterError("examples", f"{text} and at most {self.most_frames}")
@@ -142,8 +142,9 @@ def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: flo
     """
     messages = [Message(RecordDict(), dst_node_id=node, message_type=MessageType.QUERY) for node in nodes]
     roster = Roster({}, **asked)
-    for reply in sorted(grid.send_and_receive(messages, timeout=timeout_s), key=lambda r: r.metadata.src_node_id):
+    for reply in grid.send_and_receive(messages, timeout=timeout_s):  # of two with one number the first keeps it
         try:
+            check_size(answered(reply), MOST_BYTES)
             roster.add(reply)
         except ParameterError as error:
             values = {"to": "query", "reason": error.kind, "detail": plain(str(error))}
@@ -164,6 +165,12 @@ def answered(reply: Message | None) -> Message:
     if reply.has_error():
         raise ParameterError("error", plain(str(reply.error.reason)) or f"error code {reply.error.code}")
     return reply
+
+
+def check_size(reply: Message, most_bytes: float) -> None:
+    """Raise ParameterError if a reply is larger than what it could need; nothing of it is unpacked for that."""
+    if (found := count_bytes(reply.content)) > most_bytes:
+        raise ParameterError("size", f"{found / 1e6:,.0f} MB, expected at most {most_bytes / 1e6:,.0f}")
 
 
 def _statistics(text: Any, num_examples: int) -> Stats:

@@ -22,7 +22,7 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation.accountant import Ledger
 from fedvla_lib.federation.drift import geometry
-from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, plain
+from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, check_size, plain
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
 from fedvla_lib.federation.rollout_replies import Rollouts, unpack_rollouts
 from fedvla_lib.policy.optimizers import SHARING
@@ -30,6 +30,7 @@ from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.run_folder import GLOBAL
 
 logger = logging.getLogger(__name__)
+ROOM_BYTES, BYTES_A_NUMBER = 100e6, 8  # of a reply: for films and the like, and for the arrays
 PERSISTENT = ("momentum_vector", "m_t", "v_t", "limits", *messages.EXTRA)  # attributes that persist between rounds
 
 
@@ -138,6 +139,10 @@ class Checked:
         """How many numbers a client sends."""
         return len(self.records) * sum(math.prod(shape) for shape in self.shapes.values())
 
+    @property
+    def _most_bytes(self) -> float:
+        return 1e6 * self.config.reply_limit_mb or ROOM_BYTES + BYTES_A_NUMBER * self.size
+
     def state(self) -> dict[str, Arrays]:
         """Return the strategy's state beside the global arrays: by attribute, then by name."""
         kept = {name: value for name in PERSISTENT if (value := getattr(self, name, None)) is not None}
@@ -240,7 +245,8 @@ class Checked:
         valid, rejected = [], []
         for node in self._sampled:  # ordered by partition
             try:
-                check(answered(by_node.get(node)))
+                check_size(answered(by_node.get(node)), self._most_bytes)
+                check(by_node[node])
             except ParameterError as error:
                 name, reason, detail = self.roster.name(node), error.kind, plain(str(error))
                 rejected.append(reason)
