@@ -1,7 +1,7 @@
 # make book   build the book: environment, data, every chapter, HTML      make doctor  what is missing on this machine
 # make test   run everything that guards it                               make lab     open the notebooks
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
-# make new-chapter NAME=10_privacy   a chapter from the template            make check-site  every page in a browser
+# make new-chapter NAME=12_force     a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make check-zip   every chapter as a reader of the zip runs it (make test does it too)
 # make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)

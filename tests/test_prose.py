@@ -53,6 +53,20 @@ def in_glossary():
     return {word for line in inside.splitlines() if not line.startswith(" ") for word in re.split(r"[\s-]", line)}
 
 
+def glossary_terms():
+    return re.findall(r"^(\S.*)\n(?:\S.*\n)*  ", (ROOT / "book" / "glossary.md").read_text(), flags=re.MULTILINE)
+
+
+def used_before_defined(terms, texts):
+    """Terms whose first use in texts, read in order, is neither a link to the glossary nor bold, as in a definition."""
+    text = "\n".join(re.sub(r"^#.*$", "", text, flags=re.MULTILINE) for text in texts)
+    text = prose(re.sub(r"\{term\}`(?:[^`<]*<)?([^`<>]*)>?`", r"**\1**", text)).lower()
+    for term in terms:
+        first = re.search(rf"(?<![\w-]){re.escape(term.lower())}(?:s|es)?(?!\w)", text)
+        if first and text[first.start() - 2 : first.start()] != "**":
+            yield f"{term}: {text[first.start() - 40 : first.end() + 40]}"
+
+
 def unexplained(text, known):
     """Acronyms of a text that are neither known nor written out where they come first."""
     written_out = set(re.findall(r"\w+ \(([A-Z][A-Za-z0-9]+)\)", text))
@@ -68,6 +82,18 @@ def test_every_acronym_is_in_the_glossary_or_written_out(path):
 def test_an_acronym_without_a_meaning_would_be_noticed():
     assert unexplained("An MLP and a PID controller, and radial basis functions (RBF). RBF.", {"MLP"}) == {"PID"}
     assert {"TLS", "VLA", "SCAFFOLD"} <= in_glossary()
+
+
+def test_a_term_of_the_glossary_is_linked_or_explained_where_a_chapter_uses_it_first():
+    found = used_before_defined(glossary_terms(), (text for path in NOTEBOOKS for text in of_chapter(path)))
+    assert not list(found)
+
+
+def test_a_term_used_before_it_is_explained_would_be_noticed():
+    text = "## Rounds\n\nA {term}`client <client>` has a server, and **rounds** of {term}`local steps <local step>`."
+    (found,) = used_before_defined(["client", "round", "server", "local step"], [text])
+    assert found.startswith("server: ")
+    assert {"client", "round", "held-out", "Holm's method"} <= set(glossary_terms())
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -81,6 +81,12 @@ def test_partitions_with_too_few_seeds_are_filled_in_from_elsewhere():
     assert found.groupby("partition").run.unique().map(list).to_dict() == {"task": [0, 1], "iid": [5], "uneven": [5]}
 
 
+def test_rates_compare_over_the_training_seeds_that_all_methods_have():
+    rows = rollouts(*(("lab", method, "federated", "one") for method in ("first", "second", "third")))
+    found = tables.shared_seeds(rows[(rows.method != "second") | (rows.run == 1)])
+    assert set(found.run) == {1} and set(found.method) == {"first", "second", "third"}
+
+
 COMPARISON = ROOT / "book" / "reference" / "comparison"
 
 

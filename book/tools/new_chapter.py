@@ -1,6 +1,6 @@
 """Make a chapter from the template: notebook, exercise checks and wrong answers, and list it in the book.
 
-python book/tools/new_chapter.py 10_privacy
+python book/tools/new_chapter.py 12_force
 """
 
 import argparse
@@ -21,11 +21,11 @@ def make(root: Path, name: str) -> list[Path]:
     """Write the files of chapter `name` under `root` and return them.
 
     Raises:
-        ValueError: the name is not of the form 10_privacy, or its number is taken.
+        ValueError: the name is not of the form 12_force, or its number is taken.
     """
     match = NAME.fullmatch(name)
     if not match:
-        raise ValueError(f"{name!r} is not a chapter name: give two digits and words, such as 10_privacy")
+        raise ValueError(f"{name!r} is not a chapter name: give two digits and words, such as 12_force")
     number, words = match.groups()
     taken = sorted(path.name for path in (root / "notebooks").glob(f"{number}_*.ipynb"))
     if taken:
@@ -65,7 +65,7 @@ def _announce(front_page: Path, name: str) -> None:
 def main() -> int:
     """Make the chapter and print the written files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("name", help="two digits and words, such as 10_privacy")
+    parser.add_argument("name", help="two digits and words, such as 12_force")
     try:
         written = make(ROOT, parser.parse_args().name)
     except ValueError as error:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import yaml
 
+import joining
 import library
 import status
 from execution import Chapter
@@ -17,6 +18,7 @@ STATUS_PAGE = "book/run_times.md"
 STATUS = b"<!-- status -->"  # replaced by the status of the build
 MODEL_CARD = "book/nano_base.md"  # ends with generated results of the nano base
 FRONT_PAGE = "book/index.md"
+JOINING = "book/joining.md"  # has marks of `joining.parts`
 HEADLINE = b"<!-- headline -->"  # on the front page: replaced by the result of the comparison
 ARCHITECTURE, MODULES, IMPORTS = "book/architecture.md", b"<!-- modules -->", "book/_static/imports.svg"
 FUNCTIONS_PAGE, FUNCTIONS = "book/library.md", b"<!-- functions -->"
@@ -55,6 +57,8 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         rows = compared(root / COMPARISON)
         _put(wanted, FRONT_PAGE, HEADLINE, lambda: headline(rows))
         wanted[Path(OUTCOME)] = outcome(rows)
+    for mark, text in joining.parts(root).items() if Path(JOINING) in wanted else ():
+        _put(wanted, JOINING, mark, text)
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
     wanted |= _library_pages(root, wanted, executed.values())

@@ -63,11 +63,6 @@ def round_losses(events):
     return {returned}
 """
 STEP = "w = w - rate * x.T @ (x @ w - y) / len(y)"
-ORDERED = """
-def in_any_order(replies):
-    total = sum(n for _, n, _ in replies)
-    return sum({term} for _, n, array in {replies})
-"""
 
 
 def _average(lines):
@@ -145,19 +140,6 @@ WRONG = {
         (_round(step="w = w - rate * x.T @ (x @ w - y)"), "one step on all data"),
         (POOLED, "clients diverge"),
         (_round(step="w = weights - rate * x.T @ (x @ weights - y) / len(y)"), "in a row"),
-    ],
-    "in_any_order": [
-        (ORDERED.format(term="n / total * array", replies="replies"), "Other orders"),
-        (ORDERED.format(term="n * array.astype(np.float64) / total", replies="replies"), "Other orders"),
-        (
-            ORDERED.format(term="n / total * array", replies="sorted(replies, key=lambda reply: reply[1])"),
-            "Other orders",
-        ),
-        (
-            ORDERED.format(term="array / len(replies)", replies="sorted(replies, key=lambda one: one[0])"),
-            "Weight by frames",
-        ),
-        (ORDERED.format(term="n * array", replies="sorted(replies, key=lambda one: one[0])"), "over the sum of frames"),
     ],
     "surviving": [
         (_surviving(move="u[n]"), "subtract the start"),

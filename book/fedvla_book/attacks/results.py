@@ -1,6 +1,7 @@
 """The stored attacks (``book/tools/attack_study.py``) as tables, and one sentence."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,17 +79,26 @@ def members(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(table).rename(columns={"demos": "demonstrations a lab"}).set_index("seen")
 
 
-def protections(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> pd.DataFrame:
+def protections(
+    found: pd.DataFrame, epsilon: Callable[[float], float], steps: int = 40, demos: int = 2
+) -> pd.DataFrame:
     """Return the attacks under each protection: what the server finds out about a lab, with intervals.
 
     Where it sees sums only, it can look for members in the global model, as every lab can.
+
+    Args:
+        epsilon: of one round, for a noise multiplier.
+        steps: local steps of the labs whose task and place are guessed.
+        demos: demonstrations of the labs that are asked for members.
     """
     levels = sorted(noise for noise in found[found.saw == "one update"].noise.unique() if noise)
     cases = {"none": ("one update", 0.0)}
     cases |= {f"noise {noise:g} of each lab": ("one update", noise) for noise in levels}
     cases["sums only"] = ("the mean of ten", 0.0)
     table = {name: _attacked(found, saw, noise, steps, demos) for name, (saw, noise) in cases.items()}
-    chance = {"task": "50%", "place": "10%", "member (area)": "0.50"}
+    for name, (_, noise) in cases.items():
+        table[name]["epsilon of a round"] = f"{epsilon(noise):,.1f}" if noise else "none"
+    chance = {"task": "50%", "place": "10%", "member (area)": "0.50", "epsilon of a round": "0.0"}
     return pd.DataFrame({**table, "chance": chance}).T
 
 

@@ -47,7 +47,7 @@ def check(exercise: str, answer: Any) -> Verdict:
     chapter, _, name = exercise.partition(".")
     checker = _checks(chapter).get(name)
     if checker is None:
-        raise ValueError(f"unknown exercise {exercise!r}: choose from {', '.join(known(chapter)) or '01. to 09., 90.'}")
+        raise ValueError(f"unknown exercise {exercise!r}: choose from {', '.join(known(chapter)) or '01. to 10., 90.'}")
     try:
         checker(_wrapped(answer) if callable(answer) else _filled(answer))
     except Hint as hint:

@@ -1,7 +1,6 @@
 """Checks of the exercises in the chapter on federated averaging."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ Weights = dict[str, np.ndarray]
 
 
 def good_average(average: Callable[..., np.ndarray]) -> None:
-    """``average(updates, frames)`` averages arrays by frames, without the clients that sent a value not finite."""
+    """``average(updates, frames)`` averages arrays by frames, without the clients that sent a non-finite value."""
     updates = [np.array([1.0, 2.0]), np.array([5.0, -2.0]), np.array([3.0, np.nan])]
     given = average(updates, [300, 100, 600])
     expect(np.shape(given) == (2,), f"Expected two values, one for each entry, not the shape {np.shape(given)}.")
@@ -20,7 +19,7 @@ def good_average(average: Callable[..., np.ndarray]) -> None:
     expect(np.isfinite(given).all(), "NaN is in the average: leave the client out first; zero times NaN is NaN.")
     expect(not close(given, [0.8, 0.4]), "The shares no longer add up to 1: divide by the frames of those that remain.")
     expect(not close(given, [3.0, 0.0]), "A client with more frames has to count more.")
-    expect(close(given, [2.0, 1.0]), "Average those that sent finite values only, each by its frames.")
+    expect(close(given, [2.0, 1.0]), "Average those that sent finite values only, weighted by their frames.")
     given = average([np.array([np.inf, 0.0]), np.array([2.0, 4.0]), np.array([6.0, 8.0])], [10, 30, 10])
     expect(close(given, [3.0, 5.0]), "Another client sends an infinite value, which is not finite either.")
 
@@ -42,7 +41,7 @@ def round_losses(average: Callable[[list[dict[str, Any]]], Mapping[int, float]])
     """``average(events)`` maps each round to its training loss, averaged over the clients that trained, by frames."""
     given = average([*_EVENTS])
     expect(isinstance(given, Mapping), "Return a dict: for each round its loss.")
-    expect(0 not in given, "In round 0 no client trains, the model is only evaluated: look at the kind of each event.")
+    expect(0 not in given, "In round 0 no client trains; the model is only evaluated: look at the kind of each event.")
     expect(set(given) == {1, 2}, "Return one entry for each round in which a client trained.")
     found = [given[1], given[2]]
     expect(not close(found, [2.0, 1.25]), "A client with more frames counts more here, too.")
@@ -84,7 +83,7 @@ def federated_round(train: Callable[..., np.ndarray]) -> None:
         ends = np.stack([_descended([part], weights, local_steps) for part in parts])
         chained = np.stack([_descended(parts[: k + 1], weights, local_steps) for k in range(3)])
         for after in (chained[-1], chained.mean(axis=0), frames @ chained / 35):
-            expect(not close(given, after), "Each client starts from the server's weights, not where another stopped.")
+            expect(not close(given, after), "Each client starts at the server's weights, not where another stopped.")
         expect(not close(given, ends.mean(axis=0)), "Not all clients count the same: weight them by their frames.")
         right = frames @ ends / 35
         expect(local_steps > 1 or close(given, right), "With one local step it has to be one step on all data at once.")
@@ -100,18 +99,6 @@ def _descended(parts: Sequence[tuple[np.ndarray, ...]], w: np.ndarray, steps: in
         for _ in range(steps):
             w = w - 0.1 * x.T @ (x @ w - y) / len(y)
     return w
-
-
-def in_any_order(average: Callable[[list[tuple[int, int, np.ndarray]]], np.ndarray]) -> None:
-    """``average(replies)`` of (partition, frames, array) is the average by frames, with bits that ignore the order."""
-    uneven = [(2, 30, np.float32([1, 4])), (0, 10, np.float32([5, 0]))]
-    given = average([*uneven])
-    expect(not close(given, [3.0, 2.0]), "Weight by frames: a client with more of them counts more.")
-    expect(close(given, [2.0, 3.0]), "The average is the sum of frames times array, over the sum of frames.")
-    alike = [(k, 10, np.float32([value, 1])) for k, value in enumerate((1e8, 1e-9, -1e8, 3e-9))]
-    found = [average([*order]) for order in permutations(alike)]
-    same = all(np.array_equal(one, found[0]) for one in found)
-    expect(same, "Other orders of arrival give other bits: sum in an order that does not depend on arrival.")
 
 
 def surviving(share: Callable[..., float]) -> None:

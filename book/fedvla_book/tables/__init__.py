@@ -14,6 +14,7 @@ from fedvla_book.tables.grids import (
     paired,
     paired_difference,
     read_rounds,
+    shared_seeds,
 )
 from fedvla_book.tables.model import adapters, averaging_error, learning_rates, module_table
 
@@ -34,4 +35,5 @@ __all__ = [
     "learning_rates",
     "module_table",
     "read_rounds",
+    "shared_seeds",
 ]

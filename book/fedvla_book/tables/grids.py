@@ -28,6 +28,16 @@ def fill_in(rows: pd.DataFrame, other: pd.DataFrame, method: str) -> pd.DataFram
     return pd.concat([kept, other[~other.partition.isin(kept.partition)]], ignore_index=True)
 
 
+def shared_seeds(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rollouts of the training seeds that every method of `rows` has, so that success rates compare.
+
+    Args:
+        rows: of `results.read_results`.
+    """
+    methods = rows.groupby("run").method.nunique()
+    return rows[rows.run.isin(methods.index[methods == rows.method.nunique()])]
+
+
 def read_rounds(folder: Path) -> pd.DataFrame:
     """Return a row for each measured round of each federated cell in `folder`: loss and success of that global model.
 

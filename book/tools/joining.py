@@ -1,0 +1,79 @@
+"""The generated parts of the page on whether a lab should join: tables from the stored runs of the ten labs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+import status
+from fedvla_book import tables
+from fedvla_book.sentences import interval, points
+from fedvla_book.tables import results
+from fedvla_book.tables.worth import alone_at_best
+from front_page import ALONE, BY, COMPARISON, FEDERATED, LONE, POOLED, gain, gaps
+
+METHODS, CADENCES = "book/reference/ten_labs_methods", "book/reference/ten_labs_cadence"
+DEMONSTRATIONS = "demos-8"  # the partition of the headline that the ranking repeats
+FEDAVG, EVEN = "fedavg", "iid"
+MIXES = {EVEN: "dealt evenly", "dirichlet": "dealt unevenly", "task": "one task each", "lab": "one task and lab each"}
+
+
+def parts(root: Path) -> dict[bytes, Callable[[], str]]:
+    """Return what replaces each mark of the page."""
+    headline = results.read_results(root / COMPARISON)
+    at = dict(list(alone_at_best(headline).groupby("place")))
+    return {
+        b"<!-- gain -->": lambda: gain(at[results.OWN]),
+        b"<!-- elsewhere -->": lambda: elsewhere(at["unseen"], at["others"]),
+        b"<!-- mix -->": lambda: mix(results.read_results(root / CADENCES)),
+        b"<!-- strategies -->": lambda: strategies(_ranked(root, headline)),
+    }
+
+
+def elsewhere(unseen: pd.DataFrame, others: pd.DataFrame) -> str:
+    """The same in a lab that recorded nothing, and a lab alone at the task of the others."""
+    rates = results.summary(unseen, BY).set_index(["method", "demonstrations"])
+    other = results.summary(others[others.method == ALONE], BY).set_index("demonstrations")
+    found = gaps(unseen, FEDERATED, ALONE)
+    head = ["demonstrations", "alone, eleventh lab", "among ten, there", "difference [points]", "alone, others' task"]
+    lines = [
+        [f"{count:.0f}", _percent(rates.loc[(ALONE, count)]), _percent(rates.loc[(FEDERATED, count)]), found[count],
+         _percent(other.loc[count])]
+        for count in sorted(found)
+    ]  # fmt: skip
+    return status.table(head, lines)
+
+
+def mix(rows: pd.DataFrame) -> str:
+    """Success by cadence and by how the episodes are dealt, and what one task and lab each costs."""
+    home = rows[(rows.place == results.OWN) & (rows.kind == "federated")]
+    rates = results.summary(home).set_index(["method", "partition"])
+    lines = []
+    for method, part in home.groupby("method", sort=False):
+        dealt = [_percent(rates.loc[(method, name)]) if name in set(part.partition) else "" for name in MIXES]
+        outcome = part[part.partition.isin((EVEN, "lab"))].assign(method=lambda of: of.partition, partition=method)
+        (gap,) = tables.differences(outcome, [("lab", EVEN)], seed=0).itertuples()
+        lines.append([method.removeprefix("fedavg-"), *dealt, points(gap)])
+    return status.table(["rounds x clients x steps", *MIXES.values(), "last minus first"], lines)
+
+
+def strategies(home: pd.DataFrame) -> str:
+    """Methods by success, with what they cost a lab and how they compare with federated averaging."""
+    rates = results.summary(home).sort_values("success_rate", ascending=False)
+    labs, lines = home.lab.nunique(), []
+    for row in rates.itertuples():
+        found = gaps(home, row.method, FEDAVG) if row.method != FEDAVG else {}
+        cost = [f"{row.steps_in_a_row:,.0f}", f"{row.MB / labs:,.1f}"]
+        lines.append([f"`{row.method}`", *cost, _percent(row), next(iter(found.values()), "")])
+    return status.table(["method", "steps in a row", "MB a lab", "success", "minus `fedavg` [points]"], lines)
+
+
+def _ranked(root: Path, headline: pd.DataFrame) -> pd.DataFrame:
+    """The rollouts at home of all methods of the ranking, three of which belong to the headline."""
+    repeated = headline[(headline.partition == DEMONSTRATIONS) & headline.method.isin((FEDERATED, LONE, POOLED))]
+    rows = pd.concat([results.read_results(root / METHODS), repeated], ignore_index=True)
+    return tables.shared_seeds(rows[rows.place == results.OWN])
+
+
+def _percent(row: pd.Series) -> str:
+    return f"{row.success_rate:.0%} {interval(row.low, row.high)}"
