@@ -1,4 +1,4 @@
-"""How well a score tells members from strangers: the area under the ROC curve, and finds at few accusations."""
+"""How well a score tells members from strangers: the area under the ROC curve."""
 
 import numpy as np
 from scipy.stats import mannwhitneyu, rankdata
@@ -18,8 +18,3 @@ def auc_interval(members: np.ndarray, strangers: np.ndarray) -> tuple[float, flo
     error = np.sqrt(above.var(ddof=1) / m + below.var(ddof=1) / n)
     middle = auc(members, strangers)
     return max(0.0, middle - 1.96 * error), min(1.0, middle + 1.96 * error)
-
-
-def true_positives(members: np.ndarray, strangers: np.ndarray, false_positives: float = 0.01) -> float:
-    """Return the share of members found by the threshold that `false_positives` of the strangers pass."""
-    return float((members > np.quantile(strangers, 1 - false_positives, method="higher")).mean())

@@ -30,7 +30,7 @@ def hides_one_update(table: Mapping[str, Sequence[str]]) -> None:
     expect("other labs" not in summed, "Masks hide updates on the way; the model, which all labs get, holds the sum.")
     expect("server" not in given["noise by the server"], "Whoever adds the noise has seen the update without it.")
     expect("eavesdropper" in summed, "What is masked for the server is masked for everyone on the way.")
-    expect(given == HIDDEN_FROM, "Ask for each pair: does this person ever see the update without noise or mask?")
+    expect(given == HIDDEN_FROM, "Ask for each pair: does this measure change what this person sees?")
 
 
 def private_mean(mean: Callable[..., np.ndarray]) -> None:

@@ -60,7 +60,9 @@ def paired_differences(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+def differences_by_partition(
+    table: pd.DataFrame, *, ylabel: str = "partition", axes: Sequence[Axes] | None = None
+) -> Sequence[Axes]:
     """Draw differences in success between a method and others, a panel for each other method, a row for each partition.
 
     Panels have separate scales, since differences from similar and from poor methods differ in size.
@@ -83,7 +85,7 @@ def differences_by_partition(table: pd.DataFrame, *, axes: Sequence[Axes] | None
         ax.set_xlabel("difference [points],\n95 % interval")
     axes[0].set_yticks(range(len(partitions)), partitions)
     axes[0].set_ylim(len(partitions) - 0.5, -0.5)
-    axes[0].set_ylabel("partition")
+    axes[0].set_ylabel(ylabel)
     return axes
 
 
