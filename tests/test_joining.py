@@ -18,7 +18,8 @@ def said():
 
 
 def rows_of(table):
-    return [[cell.strip() for cell in line.strip()[1:-1].split("|")] for line in table.strip().splitlines()][2:]
+    lines = [line.strip() for line in table.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line[1:-1].split("|")] for line in lines][2:]
 
 
 def test_every_part_has_its_mark_on_the_page(said):
@@ -35,6 +36,12 @@ def test_gains_are_those_of_the_stored_runs_whoever_is_ahead(said):
     gaps = tables.differences(home.sort_values("demonstrations"), [("federated", "centralized")], seed=0)
     found = [row[4].split("\N{NO-BREAK SPACE}")[0] for row in rows_of(said["<!-- gain -->"])]
     assert found == [f"{100 * gap:+.0f}" for gap in gaps.difference]
+
+
+def test_a_lab_alone_is_compared_at_equal_steps_and_the_seeds_run_are_stated(said):
+    assert "steps in a row for both" in said["<!-- equal -->"] and said["<!-- equal -->"].count("[") == 5
+    for mark in ("<!-- mix -->", "<!-- strategies -->"):
+        assert "of 5 planned training seeds have been run" in said[mark]
 
 
 def test_the_strategies_are_ranked_with_their_cost_and_their_difference_from_fedavg(said):

@@ -10,6 +10,7 @@ from fedvla_book import tables
 from fedvla_book.sentences import interval, points
 from fedvla_book.tables import results
 from fedvla_book.tables.worth import alone_at_best
+from fedvla_lib.experiments.experiment_file import read_plan
 from front_page import ALONE, BY, COMPARISON, FEDERATED, LONE, POOLED, gain, gaps
 
 METHODS, CADENCES = "book/reference/ten_labs_methods", "book/reference/ten_labs_cadence"
@@ -25,8 +26,9 @@ def parts(root: Path) -> dict[bytes, Callable[[], str]]:
     return {
         b"<!-- gain -->": lambda: gain(at[results.OWN]),
         b"<!-- elsewhere -->": lambda: elsewhere(at["unseen"], at["others"]),
-        b"<!-- mix -->": lambda: mix(results.read_results(root / CADENCES)),
-        b"<!-- strategies -->": lambda: strategies(_ranked(root, headline)),
+        b"<!-- equal -->": lambda: equal_steps(headline[headline.place == results.OWN]),
+        b"<!-- mix -->": lambda: mix(results.read_results(root / CADENCES)) + _seeds(root / CADENCES),
+        b"<!-- strategies -->": lambda: strategies(_ranked(root, headline)) + _seeds(root / METHODS),
     }
 
 
@@ -42,6 +44,15 @@ def elsewhere(unseen: pd.DataFrame, others: pd.DataFrame) -> str:
         for count in sorted(found)
     ]  # fmt: skip
     return status.table(head, lines)
+
+
+def equal_steps(home: pd.DataFrame) -> str:
+    """What the federation gains over a lab alone that takes as many steps in a row."""
+    found = [f"{gap} with {count:.0f}" for count, gap in sorted(gaps(home, FEDERATED, LONE).items())]
+    steps = results.summary(home[home.method == LONE]).steps_in_a_row.iloc[0]
+    return (
+        f"With {steps:,.0f} steps in a row for both, the differences in points are {', '.join(found)} demonstrations."
+    )
 
 
 def mix(rows: pd.DataFrame) -> str:
@@ -66,6 +77,14 @@ def strategies(home: pd.DataFrame) -> str:
         cost = [f"{row.steps_in_a_row:,.0f}", f"{row.MB / labs:,.1f}"]
         lines.append([f"`{row.method}`", *cost, _percent(row), next(iter(found.values()), "")])
     return status.table(["method", "steps in a row", "MB a lab", "success", "minus `fedavg` [points]"], lines)
+
+
+def _seeds(folder: Path) -> str:
+    """How many of the planned training seeds have been run, below a table."""
+    planned = {cell.seed for cell in read_plan(folder.with_suffix(".toml")).cells}
+    run = results.read_results(folder).groupby(["method", "partition"]).run.nunique().min()
+    wide = "" if run == len(planned) else " An interval from few seeds can come out far too wide or too narrow."
+    return f"\n\nAt least {run} of {len(planned)} planned training seeds have been run.{wide}"
 
 
 def _ranked(root: Path, headline: pd.DataFrame) -> pd.DataFrame:
