@@ -641,6 +641,16 @@ def test_rollouts_arrive_as_they_were_sent():
     assert unpacked({"rollouts": "[]", "file_names": [], "files": []}, most=0) == ([], {})
 
 
+def damaged():
+    """A compressed trajectory with one byte of its content changed."""
+    archive = io.BytesIO()
+    joints = np.arange(6.0 * STEPS_TAKEN).reshape(-1, 6)
+    np.savez_compressed(archive, states=joints, actions=joints, success=False, seed=7)
+    content = bytearray(archive.getvalue())
+    content[60:90] = bytes(30)
+    return bytes(content)
+
+
 BOMB = {"states": np.zeros(10_000_000), "actions": np.zeros((STEPS_TAKEN, 6)), "success": False, "seed": 7}
 ROLLOUTS = {
     "an event of another": lambda: rolled_out(who="global"), "a round": lambda: rolled_out(round=3),
@@ -653,6 +663,12 @@ ROLLOUTS = {
     "text for bytes": lambda: rolled_out() | {"files": ["text", "text"]},
     "a trajectory that unpacks": lambda: rolled_out(arrays=BOMB),
     "code": lambda: rolled_out(arrays=BOMB | {"states": np.array([{}], dtype=object)}),
+    "a trajectory of one number": lambda: rolled_out(arrays=BOMB | {"states": 0.0, "actions": 3.0}),
+    "a damaged trajectory": lambda: rolled_out() | {"files": [rolled_out()["files"][0], damaged()]},
+    "the root": lambda: rolled_out(file="/tmp/rollout_1"), "a folder": lambda: rolled_out(file="rollout_a/b"),
+    "a program": lambda: rolled_out(video="rollout_1.py"),
+    "another alphabet": lambda: rolled_out(file="rollout_\u00e9"),
+    "a number for names": lambda: rolled_out() | {"file_names": 3}, "nested": lambda: rolled_out(rows=[[]]),
     "elsewhere": lambda: rolled_out(file="../evil"), "a long name": lambda: rolled_out(file=f"rollout_{'x' * 300}"),
     "another's file": lambda: rolled_out(video="rollout_2.mp4"),
     "too deep": lambda: rolled_out() | {"rollouts": "[" * 100_000},

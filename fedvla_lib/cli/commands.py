@@ -20,7 +20,7 @@ from fedvla_lib.robot.tasks import TASKS, check_tasks
 FAILED = 2  # exit status: bad input, or a run that failed
 DOWN = 3  # exit status of service managers for a service that is not running
 DAMAGED = 1  # exit status: some of the files are damaged
-LOCAL = "local"  # value of `who` in measurements without a federation
+LOCAL = "local"  # engine, and `who` in measurements, without a federation
 SETTINGS = {field.name for field in fields(Config)} - {"resume"}
 
 
@@ -94,6 +94,8 @@ def _trained_on(options: argparse.Namespace, chosen: Config) -> tuple[int | None
     if given := [name for name in ("client", "steps") if getattr(options, name) is not None]:
         raise ValueError(f"--{given[0]} cannot be given with --resume: a training keeps its own")
     stamp = read_stamp(options.resume)
+    if "steps" not in stamp:
+        raise ValueError(f"--resume {options.resume} does not say for how many steps: start a new training")
     return stamp["client"], stamp["steps"]
 
 
@@ -156,8 +158,9 @@ def _new_or_resumed(options: argparse.Namespace, of_train: bool = False) -> Conf
     with hold(options.resume):  # fails here rather than after the engine has started its processes
         stamp = resumable(options.resume, chosen)
     if (stamp["engine"] == LOCAL) != of_train:
-        commands = ("fedvla run or deploy", "fedvla train")[:: 1 if of_train else -1]
-        raise ValueError(f"--resume {options.resume} is a folder of {commands[0]}: {commands[1]} cannot resume it")
+        own, other = "fedvla run or deploy", "fedvla train"
+        own, other = (other, own) if of_train else (own, other)
+        raise ValueError(f"--resume {options.resume} is a folder of {other}: {own} cannot resume it")
     return chosen
 
 
