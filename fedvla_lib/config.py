@@ -160,6 +160,11 @@ def split_names(names: str) -> list[str]:
     return [name.strip() for name in names.split(",") if name.strip()]
 
 
+def sample_size(share: float, num_clients: int) -> int:
+    """Return how many clients a round samples: at least one, or none if the share is 0."""
+    return max(1, round(share * num_clients)) if share else 0
+
+
 def granted_cores() -> int:
     """Return the number of CPU cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -189,7 +194,7 @@ def check(config: Config) -> Config:
     once = bool(task_names(config)) and len(set(task_names(config))) == len(task_names(config))
     _require(once, config, "tasks", "task names separated by commas, each once")
     _require(DEVICE.fullmatch(config.device) is not None, config, "device", "cpu, cuda, cuda:K or mps")
-    drawn = max(1, round(config.fraction_train * config.num_clients))
+    drawn = sample_size(config.fraction_train, config.num_clients)
     few = config.strategy != "krum" or 2 * config.num_malicious < drawn
     _require(few, config, "num_malicious", f"less than half of the {drawn} clients of a round")
     _check_privacy(config)
@@ -221,8 +226,8 @@ def _check_privacy(config: Config) -> None:
     _require(config.sampling == "uniform", config, "sampling", "uniform: clients do not announce their tasks")
     if config.secure_aggregation:
         _require(config.exchange == "float32", config, "exchange", "float32: masked numbers have a format of their own")
-        clients = max(1, round(config.fraction_train * config.num_clients))
-        _require(clients >= 3, config, "fraction_train", "a share of 3 clients or more: fewer cannot hide")
+        drawn = sample_size(config.fraction_train, config.num_clients)
+        _require(drawn >= 3, config, "fraction_train", "a share of 3 clients or more: fewer cannot hide")
 
 
 def _require(ok: bool, config: Config, name: str, valid: str) -> None:

@@ -15,11 +15,10 @@ from typing import Any
 from filelock import FileLock
 
 from fedvla_lib import files, provenance, run_folder
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, sample_size
 from fedvla_lib.data import normalisation
 from fedvla_lib.engines import inline
 from fedvla_lib.federation.client import Client, open_client, open_pooled
-from fedvla_lib.federation.nodes import sample_size
 from fedvla_lib.files import cache_dir
 from fedvla_lib.policy import model, nano, prefix_cache
 from fedvla_lib.policy.training import TrainResult, local_train

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from fedvla_lib import files
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, sample_size
 from fedvla_lib.federation import privacy, secure_aggregation
-from fedvla_lib.federation.nodes import sample_size
 
 SPENT_FILE = "privacy.json"  # in a run folder: never goes back, unlike the metrics of a run that is resumed
 MOST_NOISE = 1e6

@@ -10,6 +10,7 @@ import numpy as np
 from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
+from fedvla_lib.config import sample_size
 from fedvla_lib.data.normalisation import Stats, implausible, unpack_stats
 from fedvla_lib.federation.messages import NOTE, count_bytes
 from fedvla_lib.policy.parameters import ParameterError
@@ -110,11 +111,6 @@ class Roster:
             raise ParameterError(error.kind, f"{client_name(partition_id)}: {error}") from error
         self.partition_of[node], self.examples_of[node] = partition_id, num_examples
         self.tasks_of[node] = tuple(tasks)
-
-
-def sample_size(share: float, num_clients: int) -> int:
-    """Return how many clients a round samples: at least one, or none if the share is 0."""
-    return max(1, round(share * num_clients)) if share else 0
 
 
 def client_name(partition_id: int) -> str:

@@ -32,8 +32,7 @@ from flwr.supercore.primitives.asymmetric import (
     public_key_to_bytes,
 )
 
-from fedvla_lib.config import Config
-from fedvla_lib.federation.nodes import sample_size
+from fedvla_lib.config import Config, sample_size
 
 LEAST_CLIENTS = 3  # in a round: of two, each knows the other's vector from the sum
 MOST_NEIGHBOURS = 20  # of a client; with fewer clients, everyone is everyone's neighbour

@@ -17,10 +17,10 @@ from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.common.constant import ErrorCode
 from flwr.serverapp import Grid
 
-from fedvla_lib.config import Config, from_run_config
+from fedvla_lib.config import Config, from_run_config, sample_size
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation import secure_aggregation as secure
-from fedvla_lib.federation.nodes import Report, TooFewReplies, answered, sample_size
+from fedvla_lib.federation.nodes import Report, TooFewReplies, answered
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_digest, digest
 from fedvla_lib.run_folder import GLOBAL
 
