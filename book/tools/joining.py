@@ -9,26 +9,25 @@ import status
 from fedvla_book import tables
 from fedvla_book.sentences import interval, points
 from fedvla_book.tables import results
-from fedvla_book.tables.worth import alone_at_best
+from fedvla_book.tables.worth import alone_at_best, ranking
 from fedvla_lib.experiments.experiment_file import read_plan
-from front_page import ALONE, BY, COMPARISON, FEDERATED, LONE, POOLED, gain, gaps
+from front_page import ALONE, BY, COMPARISON, FEDERATED, LONE, gain, gaps
 
 METHODS, CADENCES = "book/reference/ten_labs_methods", "book/reference/ten_labs_cadence"
-DEMONSTRATIONS = "demos-8"  # the partition of the headline that the ranking repeats
 FEDAVG, EVEN = "fedavg", "iid"
 MIXES = {EVEN: "dealt evenly", "dirichlet": "dealt unevenly", "task": "one task each", "lab": "one task and lab each"}
 
 
 def parts(root: Path) -> dict[bytes, Callable[[], str]]:
     """Return what replaces each mark of the page."""
-    headline = results.read_results(root / COMPARISON)
+    headline, cadences, methods = (results.read_results(root / folder) for folder in (COMPARISON, CADENCES, METHODS))
     at = dict(list(alone_at_best(headline).groupby("place")))
     return {
         b"<!-- gain -->": lambda: gain(at[results.OWN]),
         b"<!-- elsewhere -->": lambda: elsewhere(at["unseen"], at["others"]),
         b"<!-- equal -->": lambda: equal_steps(headline[headline.place == results.OWN]),
-        b"<!-- mix -->": lambda: mix(results.read_results(root / CADENCES)) + _seeds(root / CADENCES),
-        b"<!-- strategies -->": lambda: strategies(_ranked(root, headline)) + _seeds(root / METHODS),
+        b"<!-- mix -->": lambda: mix(cadences) + _seeds(root / CADENCES, cadences),
+        b"<!-- strategies -->": lambda: strategies(ranking(methods, headline)) + _seeds(root / METHODS, methods),
     }
 
 
@@ -57,7 +56,7 @@ def equal_steps(home: pd.DataFrame) -> str:
 
 def mix(rows: pd.DataFrame) -> str:
     """Success by cadence and by how the episodes are dealt, and what one task and lab each costs."""
-    home = rows[(rows.place == results.OWN) & (rows.kind == "federated")]
+    home = rows[(rows.place == results.OWN) & (rows.kind == results.FEDERATED)]
     rates = results.summary(home).set_index(["method", "partition"])
     lines = []
     for method, part in home.groupby("method", sort=False):
@@ -79,19 +78,12 @@ def strategies(home: pd.DataFrame) -> str:
     return status.table(["method", "steps in a row", "MB a lab", "success", "minus `fedavg` [points]"], lines)
 
 
-def _seeds(folder: Path) -> str:
+def _seeds(folder: Path, rows: pd.DataFrame) -> str:
     """How many of the planned training seeds have been run, below a table."""
     planned = {cell.seed for cell in read_plan(folder.with_suffix(".toml")).cells}
-    run = results.read_results(folder).groupby(["method", "partition"]).run.nunique().min()
+    run = rows.groupby(["method", "partition"]).run.nunique().min()
     wide = "" if run == len(planned) else " An interval from few seeds can come out far too wide or too narrow."
     return f"\n\nAt least {run} of {len(planned)} planned training seeds have been run.{wide}"
-
-
-def _ranked(root: Path, headline: pd.DataFrame) -> pd.DataFrame:
-    """The rollouts at home of all methods of the ranking, three of which belong to the headline."""
-    repeated = headline[(headline.partition == DEMONSTRATIONS) & headline.method.isin((FEDERATED, LONE, POOLED))]
-    rows = pd.concat([results.read_results(root / METHODS), repeated], ignore_index=True)
-    return tables.shared_seeds(rows[rows.place == results.OWN])
 
 
 def _percent(row: pd.Series) -> str:

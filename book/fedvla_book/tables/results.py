@@ -16,7 +16,7 @@ OF_CELL = ("method", "kind", "partition", "gradient_steps", "samples", "bytes")
 RECORDING = ("data", "tasks", "episodes_per_task", "image_size", "num_labs", "one_task_per_lab", "val_fraction")
 OWN = "own"  # place of a rollout at a lab's own task in that lab
 PARALLEL = ("federated", "clients")  # kinds whose clients train in parallel
-LOCAL_ONLY = "local-only"
+LOCAL_ONLY, FEDERATED = "local-only", "federated"  # kinds of methods
 HELD_OUT = ("loss", "action_error")
 
 

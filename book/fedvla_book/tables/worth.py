@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from fedvla_book.tables.grids import resampled_means
+from fedvla_book.tables.grids import resampled_means, shared_seeds
 from fedvla_book.tables.intervals import by_run
-from fedvla_book.tables.results import LOCAL_ONLY, OWN
+from fedvla_book.tables.results import FEDERATED, LOCAL_ONLY, OWN
 from fedvla_lib.evaluation.statistics import CONFIDENCE
 
 
@@ -51,6 +51,22 @@ def alone_at_best(rows: pd.DataFrame) -> pd.DataFrame:
     best = rates.idxmax(axis=1)
     kept = alone[alone.method == alone.demonstrations.map(best)].assign(method=LOCAL_ONLY)
     return pd.concat([rows[rows.kind != LOCAL_ONLY], kept], ignore_index=True)
+
+
+def ranking(methods: pd.DataFrame, headline: pd.DataFrame) -> pd.DataFrame:
+    """Return the rollouts at home of all methods that are ranked, of the training seeds that every method has.
+
+    These are the rows of `methods`, and from `headline` those of the same partition whose models took as many steps in
+    a row as its federation.
+
+    Args:
+        methods: of `results.read_results`.
+        headline: of `results.read_results`.
+    """
+    steps = headline[headline.kind == FEDERATED].steps_in_a_row.iloc[0]
+    repeated = headline[headline.partition.isin(methods.partition) & (headline.steps_in_a_row == steps)]
+    rows = pd.concat([methods, repeated], ignore_index=True)
+    return shared_seeds(rows[rows.place == OWN])
 
 
 def worth(
