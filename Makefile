@@ -122,6 +122,7 @@ lint: $(STAMP)
 # from the wheel. In this folder, with injected parameters (papermill), `make book` runs them; .ci/run does both.
 test: export FEDVLA_PROFILE := tiny
 test: export HF_HUB_OFFLINE := 1
+test: export COVERAGE_CORE := sysmon
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml

@@ -22,7 +22,7 @@ Report = Callable[[int, str, str, dict[str, Any]], None]
 MEASURES = {"mean": NUM_JOINTS, "std": NUM_JOINTS, "min": NUM_JOINTS, "max": NUM_JOINTS, "count": 1}  # -> length
 MOST_FRAMES = 2**40  # keeps the sum of all counts in 64 bits; it does not protect against a client that lies
 FURTHEST = 360.0  # degrees, or percent of the gripper: no joint of the arm gets as far
-MOST_BYTES = 1e6  # of an introduction
+MOST_BYTES = 1e6  # of an introduction, and of a letter of secure aggregation
 LONGEST = 1000  # characters of the name of a task, and of a reason
 ROUNDING = 1e-6  # relative: how far a mean may lie outside its range
 

@@ -20,7 +20,7 @@ from flwr.serverapp import Grid
 from fedvla_lib.config import Config, from_run_config, sample_size
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation import secure_aggregation as secure
-from fedvla_lib.federation.nodes import Report, TooFewReplies, answered
+from fedvla_lib.federation.nodes import MOST_BYTES, Report, TooFewReplies, answered, check_size
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_digest, digest
 from fedvla_lib.run_folder import GLOBAL
 
@@ -110,7 +110,9 @@ class SecureGrid:
         vectors, refused = {}, []
         for me, order in orders.items():
             try:
-                content = answered(replies.get(me)).content
+                reply = answered(replies.get(me))
+                check_size(reply, MOST_BYTES + np.uint32().nbytes * size)
+                content = reply.content
                 if messages.METRICS not in content.metric_records:
                     raise ParameterError("metrics", f"there is no record {messages.METRICS!r}")
                 arrays = messages.unpack_arrays(content.array_records.get(messages.ARRAYS, {}))
@@ -158,7 +160,9 @@ class SecureGrid:
         }
         replies = _by_client(asked, self._grid.send_and_receive(list(asked.values()), timeout=timeout))
         good = {me: reply for me, reply in replies.items() if not reply.has_error() and RECORD in reply.content}
-        self._bytes += sum(messages.count_bytes(one.content) for one in [*asked.values(), *good.values()])
+        sizes = {me: messages.count_bytes(reply.content) for me, reply in good.items()}
+        good = {me: reply for me, reply in good.items() if sizes[me] <= MOST_BYTES}
+        self._bytes += sum(messages.count_bytes(one.content) for one in asked.values()) + sum(map(sizes.get, good))
         return {me: good[me].content[RECORD] for me in asked if me in good}
 
     def _payload(self, vector: np.ndarray) -> privacy.Payload:
