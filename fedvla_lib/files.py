@@ -1,4 +1,4 @@
-"""The cache folder, and atomic writes of files and folders."""
+"""The cache folder, atomic writes of files and folders, and JSON that is checked when it is read."""
 
 import json
 import math
@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,46 @@ from typing import Any
 def cache_dir() -> Path:
     """Return the folder of cached recordings, frames, meshes and models: ``$FEDVLA_CACHE`` or ``~/.cache/fedvla``."""
     return Path(os.environ.get("FEDVLA_CACHE") or Path.home() / ".cache" / "fedvla")
+
+
+@cache
+def _checker(shape: Any) -> Any:
+    from pydantic import TypeAdapter  # here, since the doctor imports this module where packages may be missing
+
+    return TypeAdapter(shape)
+
+
+def read_json(path: Path, shape: Any = dict[str, Any]) -> Any:
+    """Return what a JSON file holds, see `parse_json`."""
+    return parse_json(Path(path).read_bytes(), shape, str(path))
+
+
+def parse_json(text: str | bytes, shape: Any, name: str) -> Any:
+    """Return what a JSON text holds.
+
+    Args:
+        shape: the type that the content must have; a TypedDict names what has to be there, and there may be more.
+        name: of the text, for the message.
+
+    Raises:
+        ValueError: it is not JSON, or not of that type.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:  # also for text that is not UTF-8, and for deep nesting
+        raise ValueError(f"{name} is damaged: {error}") from error
+    return checked(content, shape, name)
+
+
+def checked(content: Any, shape: Any, name: str) -> Any:
+    """Return `content` as it is if it has the type `shape`; raise ValueError that says where it has not."""
+    try:
+        _checker(shape).validate_python(content, strict=True)
+        return content
+    except ValueError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{name} is damaged: {where + ': ' if where else ''}{first['msg']}") from error
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -21,18 +21,67 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import pandas as pd
 from filelock import FileLock, Timeout
 
 from fedvla_lib.config import Config, from_run_config
-from fedvla_lib.files import as_json, write_atomically, write_json
+from fedvla_lib.files import as_json, checked, parse_json, read_json, write_atomically, write_json
 from fedvla_lib.provenance import config_hash, deciding, first_stamp, now
 
 STAMP_FORMAT = "%Y%m%d_%H%M%S"
 GLOBAL, LOCK, METRICS_FILE = "global", ".lock", "metrics.jsonl"
 LOCK_TIMEOUT_S = 1.0  # longer than another process holds the lock just to test it
+
+
+class Stamp(TypedDict):
+    """What readers of ``stamp.json`` rely on. In this and the other types there may be more."""
+
+    status: str
+    engine: str
+    started: str
+    seed: int
+    wall_s: float | None
+    resumed: NotRequired[list[str]]
+
+
+class Event(TypedDict):
+    """A line of ``metrics.jsonl``."""
+
+    round: int
+    who: str
+    kind: str
+    time: str
+    values: dict[str, Any]
+
+
+class Trained(TypedDict):
+    """The values that every event ``train`` has."""
+
+    steps: int
+
+
+class Rollout(TypedDict):
+    """The values that every event ``rollout`` has."""
+
+    task: str
+    lab: str
+    seed: int
+    success: bool
+    steps: int
+
+
+class HeldOut(TypedDict):
+    """The values that every event ``held-out`` has: an episode's."""
+
+    episode_id: int
+    num_examples: float
+    loss: float | None
+    action_error: float | None
+
+
+VALUES = {"train": Trained, "rollout": Rollout, "held-out": HeldOut}  # by kind of event; others may hold anything
 
 
 @dataclass(frozen=True)
@@ -138,17 +187,20 @@ def resumable(root: Path, config: Config) -> dict[str, Any]:
 
 
 def read_config(root: Path) -> Config:
-    """Return the settings of a run."""
-    return from_run_config(json.loads((Path(root) / "config.json").read_text()))
+    """Return the settings of a run; raise ValueError if they cannot be read."""
+    return from_run_config(read_json(Path(root) / "config.json"))
 
 
 def read_stamp(root: Path) -> dict[str, Any]:
     """Return the stamp of a run: commit, versions, hardware, status, wall time.
 
     A killed process leaves ``running`` in the file; if no process writes to the run, the status is ``interrupted``.
+
+    Raises:
+        ValueError: it cannot be read.
     """
-    stamp = json.loads((Path(root) / "stamp.json").read_text())
-    if stamp.get("status") == "running" and not is_held(Path(root)):
+    stamp = read_json(Path(root) / "stamp.json", Stamp)
+    if stamp["status"] == "running" and not is_held(Path(root)):
         stamp["status"] = "interrupted"
     return stamp
 
@@ -174,8 +226,13 @@ def counted_steps(root: Path) -> dict[str, int]:
 
     ``in_all`` sums over all averaged replies; ``in_a_row`` sums the largest count of each round, since the clients of a
     round train in parallel.
+
+    Raises:
+        ValueError: not a run folder, or its clients counted none.
     """
     trained = read_metrics(root, "train")
+    if trained.empty:
+        raise ValueError(f"{root} has no event of a client's training")
     return {"in_all": int(trained.steps.sum()), "in_a_row": int(trained.groupby("round").steps.max().sum())}
 
 
@@ -199,13 +256,15 @@ def read_events(root: Path) -> list[dict[str, Any]]:
     path = Path(root) / METRICS_FILE
     if not path.is_file():
         raise ValueError(f"{root} is not a run folder: it has no {METRICS_FILE}")
-    events = []
-    for number, line in enumerate(path.read_text().split("\n")[:-1], start=1):  # a crash cuts off the last line
-        try:
-            events.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path} line {number} is not an event: {error.msg}") from error
-    return events
+    lines = path.read_bytes().split(b"\n")[:-1]  # a crash cuts off the last line
+    return [_read_event(line, f"{path} line {number}") for number, line in enumerate(lines, start=1)]
+
+
+def _read_event(line: bytes, name: str) -> dict[str, Any]:
+    event = parse_json(line, Event, name)
+    if shape := VALUES.get(event["kind"]):
+        checked(event["values"], shape, f"{name} ({event['kind']})")
+    return event
 
 
 def run_folders(config: Config) -> set[Path]:

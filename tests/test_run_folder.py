@@ -19,6 +19,7 @@ from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config, from_profile
 
 pytestmark = pytest.mark.unit
+ROLLOUT = {"task": "lift", "lab": "", "seed": 3, "success": True, "steps": 77}
 
 
 def make(config: Config):
@@ -59,13 +60,18 @@ def test_the_hash_follows_what_is_computed_not_where():
 def test_events_become_columns(tmp_path):
     with run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
         run.log(0, "global", "evaluate", {"loss": np.float32(2.0), "success_rate": 0.5})
-        run.log(1, "client_0", "train", {"loss": 1.0, "num_examples": np.int64(12)})
-        run.log(1, "client_1", "rollout", {"success": np.bool_(False), "completion_time_s": float("nan"), "round": 99})
+        run.log(1, "client_0", "train", {"loss": 1.0, "steps": np.int64(12)})
+        run.log(
+            1,
+            "client_1",
+            "rollout",
+            ROLLOUT | {"success": np.bool_(False), "completion_time_s": float("nan"), "round": 99},
+        )
     table = run_folder.read_metrics(run.root)
     assert table["round"].tolist() == [0, 1, 1]
     assert table.loss.tolist()[:2] == [2.0, 1.0]
     only = run_folder.read_metrics(run.root, "train")
-    assert list(only.columns) == ["round", "who", "kind", "time", "loss", "num_examples"]
+    assert list(only.columns) == ["round", "who", "kind", "time", "loss", "steps"]
     assert run_folder.read_metrics(run.root, "nothing").empty
     for line in (run.root / "metrics.jsonl").read_text().splitlines():
         json.loads(line, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
@@ -76,7 +82,7 @@ def test_a_federations_steps_are_counted_by_its_clients_round_by_round(tmp_path)
         for number, who, steps in ((1, "client_0", 4), (1, "client_1", 3), (2, "client_1", 5)):
             run.log(number, who, "train", {"loss": 1.0, "steps": steps})
         run.log(2, "client_0", "rejected", {"to": "train", "reason": "hash"})
-        run.log(2, "global", "rollout", {"success": True, "steps": 77})  # control steps of the robot
+        run.log(2, "global", "rollout", ROLLOUT)  # control steps of the robot
     assert run_folder.counted_steps(run.root) == {"in_all": 4 + 3 + 5, "in_a_row": 4 + 5}
 
 
@@ -88,7 +94,7 @@ def test_a_line_cut_off_by_a_crash_is_left_out_and_a_broken_one_is_named(tmp_pat
     path.write_text(whole + '{"round": 2, "who": "glo')
     assert len(run_folder.read_metrics(run.root)) == 1
     path.write_text('{"round": 2, "who": "glo\n' + whole)
-    with pytest.raises(ValueError, match="metrics.jsonl line 1 is not an event"):
+    with pytest.raises(ValueError, match="metrics.jsonl line 1 is damaged"):
         run_folder.read_metrics(run.root)
 
 
@@ -130,7 +136,10 @@ def test_a_run_is_going_on_as_long_as_its_process_lives(tmp_path):
 
 
 def test_a_stamp_of_a_run_before_there_were_locks_is_read_too(tmp_path):
-    files.write_json(tmp_path / "stamp.json", {"status": "running"})
+    files.write_json(
+        tmp_path / "stamp.json",
+        {"status": "running"} | dict.fromkeys(("engine", "started"), "") | {"seed": 0, "wall_s": None},
+    )
     assert run_folder.read_stamp(tmp_path)["status"] == "interrupted"
     assert not (tmp_path / run_folder.LOCK).exists()
 

@@ -9,10 +9,10 @@ import os
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from fedvla_lib.config import Config, from_profile, split_names, to_run_config
-from fedvla_lib.files import write_atomically
+from fedvla_lib.files import read_json, write_atomically
 from fedvla_lib.pretraining.recipe import Recipe
 from fedvla_lib.robot.spec import CAMERAS, image_key
 from fedvla_lib.robot.tasks import TASKS, check_tasks
@@ -22,6 +22,14 @@ DOWN = 3  # exit status of service managers for a service that is not running
 DAMAGED = 1  # exit status: some of the files are damaged
 LOCAL = "local"  # engine, and `who` in measurements, without a federation
 SETTINGS = {field.name for field in fields(Config)} - {"resume"}
+
+
+class SavedPolicy(TypedDict):
+    """What is read from a policy's ``config.json``."""
+
+    input_features: dict[str, dict[str, Any]]
+    chunk_size: int
+    n_action_steps: int
 
 
 def settings(options: argparse.Namespace, **overrides: Any) -> Config:
@@ -314,8 +322,8 @@ def _saved_settings(folder: Path) -> Config:
     """
     if not (file := folder / "config.json").is_file():
         raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
-    saved = json.loads(file.read_text())
-    shape = saved.get("input_features", {}).get(image_key(CAMERAS[0]), {}).get("shape")
+    saved = read_json(file, SavedPolicy)
+    shape = saved["input_features"].get(image_key(CAMERAS[0]), {}).get("shape")
     if not shape:
         raise ValueError(f"{folder} has no camera {CAMERAS[0]!r}: the simulator shows {', '.join(CAMERAS)}")
     chunk = {name: saved[name] for name in ("chunk_size", "n_action_steps")}

@@ -7,6 +7,7 @@ Bad input ends with one line on stderr and exit status 2, Ctrl-C with a line tha
 import argparse
 import signal
 import sys
+import tempfile
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
@@ -35,9 +36,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except EXPECTED as error:
         if options.traceback:
             traceback.print_exc()
-        message = " ".join(str(error).split()) or type(error).__name__
-        print(f"fedvla {options.command}: {message}", file=sys.stderr)
-        return FAILED
+        return _failed(options.command, error)
+    except Exception as error:  # a mistake of ours: the user gets one line all the same, and we get the traceback
+        with tempfile.NamedTemporaryFile("w", prefix="fedvla-", suffix=".log", delete=False) as log:
+            traceback.print_exc(file=log)
+        return _failed(options.command, error, f" (this should not happen: the traceback is in {log.name})")
+
+
+def _failed(command: str, error: Exception, beside: str = "") -> int:
+    message = " ".join(str(error).split())
+    message = message if isinstance(error, EXPECTED) and message else f"{type(error).__name__} {message}".strip()
+    print(f"fedvla {command}: {message}{beside}", file=sys.stderr)
+    return FAILED
 
 
 def _check_counts(options: argparse.Namespace) -> None:

@@ -6,20 +6,19 @@ the folder at any moment and finds complete episodes only; a killed process (eve
 episode. Episode i has its own files and seeds, so its content does not depend on interruptions.
 """
 
-import json
 import sys
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from filelock import FileLock
 from tqdm.auto import tqdm
 
 from fedvla_lib.data.episode_writer import INFO_FILE, LOCK, SETTINGS_FILE, STAGING, EpisodeWriter
-from fedvla_lib.files import write_json
+from fedvla_lib.files import read_json, write_json
 from fedvla_lib.robot.expert import Expert
 from fedvla_lib.robot.labs import labs
 from fedvla_lib.robot.rollout import Episode, run_episode
@@ -121,7 +120,7 @@ def _check_folder(root: Path, settings: dict[str, Any]) -> None:
         if foreign or root.is_file():
             raise ValueError(f"{root} is not a recording made by this command ({foreign}): give another folder")
         return
-    recorded = OLD_DEFAULTS | json.loads((root / SETTINGS_FILE).read_text())
+    recorded = OLD_DEFAULTS | read_json(root / SETTINGS_FILE)
     for name, value in settings.items():
         before = recorded.get(name)
         if name != "episodes_per_task" and before != value:
@@ -133,9 +132,15 @@ def _check_folder(root: Path, settings: dict[str, Any]) -> None:
         )
 
 
+class Recorded(TypedDict):
+    """What is read from `INFO_FILE`."""
+
+    total_episodes: int
+
+
 def _num_recorded(root: Path) -> int:
     path = root / INFO_FILE
-    return json.loads(path.read_text())["total_episodes"] if path.exists() else 0
+    return read_json(path, Recorded)["total_episodes"] if path.exists() else 0
 
 
 def _record_missing(root: Path, settings: dict[str, Any], missing: range, jobs: int, progress: bool) -> None:

@@ -4,15 +4,15 @@
 connections it serves are in `connections.toml`.
 """
 
-import json
 import re
 import tomllib
 from pathlib import Path
+from typing import TypedDict
 
 import psutil
 
 from fedvla_lib.engines import processes, superlink
-from fedvla_lib.files import write_atomically, write_json
+from fedvla_lib.files import read_json, write_atomically, write_json
 
 CONNECTIONS = Path(__file__).resolve().parent / "connections.toml"
 NAME = "local-simulation"
@@ -98,10 +98,17 @@ def last(home: Path) -> tuple[bool, str]:
     return status == superlink.COMPLETED, f"run {runs[0]['run-id']} is {status} ({details})"
 
 
+class Service(TypedDict):
+    """Which process `up` started; ``created`` in seconds, as psutil says it."""
+
+    pid: int
+    created: float
+
+
 def _running(home: Path) -> psutil.Process | None:
     """Return the process that `up` started, if it still runs; start times are compared, as ids are reused."""
     try:
-        saved = json.loads((home / "superlink.json").read_text())
+        saved = read_json(home / "superlink.json", Service)
         process = psutil.Process(saved["pid"])
         return process if process.create_time() == saved["created"] and process.is_running() else None
     except (FileNotFoundError, psutil.NoSuchProcess):

@@ -7,7 +7,6 @@ Results are cached by settings and by the digest of the code that determines the
 """
 
 import hashlib
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from fedvla_lib.config import Config, sample_size
 from fedvla_lib.data import normalisation
 from fedvla_lib.engines import inline
 from fedvla_lib.federation.client import Client, open_client, open_pooled
-from fedvla_lib.files import cache_dir
+from fedvla_lib.files import cache_dir, read_json
 from fedvla_lib.policy import model, nano, prefix_cache
 from fedvla_lib.policy.training import TrainResult, local_train
 from fedvla_lib.provenance import code_digest
@@ -93,7 +92,7 @@ def counted(config: Config, partition_id: int | None = None) -> dict[str, int]:
     if not file.is_file():
         name = _name(partition_id)
         raise ValueError(f"{name} has not been trained with these settings: train it before asking for its steps")
-    return json.loads(file.read_text())
+    return read_json(file, dict[str, int])
 
 
 def train_alone(bundle: model.Bundle, client: Client, *, steps: int, **options: Any) -> TrainResult:

@@ -4,10 +4,10 @@ Neighbouring runs differ in one client's payloads, which are replaced by zeros i
 adds up over rounds and is converted at the end, by the library dp-accounting.
 """
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 from scipy.optimize import brentq
@@ -18,6 +18,12 @@ from fedvla_lib.federation import privacy, secure_aggregation
 
 SPENT_FILE = "privacy.json"  # in a run folder: never goes back, unlike the metrics of a run that is resumed
 MOST_NOISE = 1e6
+
+
+class Spent(TypedDict):
+    """What is read from `SPENT_FILE`."""
+
+    releases: int
 
 
 class BudgetSpent(RuntimeError):
@@ -126,7 +132,7 @@ class Ledger:
             BudgetSpent: it would exceed the budget.
         """
         file = self.root / SPENT_FILE
-        count = 1 + (json.loads(file.read_text())["releases"] if file.is_file() else 0)
+        count = 1 + (files.read_json(file, Spent)["releases"] if file.is_file() else 0)
         spent, budget = epsilon(self.config, count, self.size), self.config.epsilon_budget
         if budget and spent > budget:
             raise BudgetSpent(f"release {count} would make epsilon {spent:.3g}, more than epsilon-budget={budget:g}")

@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import av
 import numpy as np
 from flwr.app import ConfigRecord, RecordDict
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from fedvla_lib.federation.messages import NOTE, make_note
+from fedvla_lib.files import parse_json
 from fedvla_lib.policy.parameters import ParameterError
 
 # Rows, one per rollout, as from `rollouts.evaluate` with file names as videos; and the files (mp4, npz) by name.
@@ -44,9 +45,6 @@ class Row(BaseModel):
     video: Annotated[str, Field(pattern=VIDEO_NAME)]
 
 
-ROWS = TypeAdapter(list[Row])
-
-
 def pack_rollouts(rows: list[dict[str, Any]], folder: Path) -> ConfigRecord:
     """Return rows and the files of `folder` as a note, so that they reach the server on every engine."""
     files = sorted(folder.iterdir())
@@ -66,13 +64,10 @@ def unpack_rollouts(content: RecordDict, tasks: Collection[str], most: int) -> R
     """
     note = content.config_records.get(NOTE, {})
     try:
-        rows = [row.model_dump() for row in ROWS.validate_python(json.loads(note["rollouts"]))]
+        found = parse_json(note["rollouts"], list[Row], "the list of rollouts")
+        rows = [{name: row[name] for name in Row.model_fields} for row in found]  # in one order, whoever sent them
         files = dict(zip(note["file-names"], note["files"], strict=True))
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ParameterError("rollouts", f"rollouts cannot be read: {where}: {first['msg']}") from error
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ParameterError("rollouts", f"rollouts cannot be read: {error!r}") from error
     if len(rows) > most:
         raise ParameterError("rollouts", f"{len(rows)} rollouts, expected at most {most}")

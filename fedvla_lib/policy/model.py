@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from draccus.utils import DecodingError
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OfflineModeIsEnabled
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAConfig, SmolVLAPolicy
 from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, TransitionKey, create_transition
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 
 from fedvla_lib.config import Config, granted_cores, split_names
 from fedvla_lib.data.normalisation import Stats
@@ -31,6 +32,10 @@ from fedvla_lib.policy.nano import NANO, NANO_RANDOM, VLM_FOLDER, WEIGHTS_FILE, 
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
 
+UNREADABLE = (
+    LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError, DecodingError,
+    SafetensorError,
+)  # fmt: skip  # what LeRobot raises for a policy that is missing or damaged
 POSITION_STD = 0.3  # standard deviation of the nano vision encoder's initial position embeddings
 SMALL = 50_000_000  # parameters below which one thread is used; the nano policy has 2.4 million, SmolVLA 450
 
@@ -169,7 +174,7 @@ def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
             settings.vlm_model_name = str((Path(base) / VLM_FOLDER).resolve())
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints a line for each load
             policy = SmolVLAPolicy.from_pretrained(base, config=settings)
-    except (LocalEntryNotFoundError, OfflineModeIsEnabled, HfHubHTTPError, HFValidationError, OSError) as error:
+    except UNREADABLE as error:
         reason = str(error).strip().splitlines()[0][:160]
         raise ValueError(
             f"base={config.base!r} could not be loaded ({reason}): give {NANO!r}, {NANO_RANDOM!r}, a folder in "

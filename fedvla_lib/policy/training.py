@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config
-from fedvla_lib.files import new_folder
+from fedvla_lib.files import new_folder, read_json
 from fedvla_lib.policy import optimizers
 from fedvla_lib.policy.model import Bundle, use_threads
 from fedvla_lib.policy.parameters import Arrays, trainable
@@ -188,7 +188,7 @@ def _restore(bundle: Bundle, optimizer: Any, scheduler: Any, checkpoints: Checkp
     with torch.no_grad():
         for name, parameter in parameters.items():
             parameter.copy_(saved[name])
-    return json.loads((newest / LOSSES_FILE).read_text())
+    return read_json(newest / LOSSES_FILE, list[float])
 
 
 def with_gradient(parameters: Parameters, shared: Container[str]) -> list[tuple[str, torch.nn.Parameter]]:

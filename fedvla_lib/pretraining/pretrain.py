@@ -22,7 +22,7 @@ from fedvla_lib.data import frame_store, normalisation, record
 from fedvla_lib.data.batches import Batches
 from fedvla_lib.evaluation.rollouts import evaluate, rollout_seeds
 from fedvla_lib.evaluation.statistics import success_table
-from fedvla_lib.files import cache_dir, new_folder, write_json
+from fedvla_lib.files import cache_dir, new_folder, read_json, write_json
 from fedvla_lib.policy import model, nano
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.prefix_cache import with_cached_prefixes
@@ -170,4 +170,4 @@ def read_account(base: Path | None = None) -> dict[str, Any]:
     path = (base or nano.nano_base()) / CARD_FILE
     if not path.is_file():
         raise ValueError(f"{path.parent} has no {CARD_FILE}: it was not made by fedvla pretrain")
-    return json.loads(path.read_text())
+    return read_json(path)
