@@ -19,7 +19,7 @@ from fedvla_lib.robot.tasks import TASKS, check_tasks
 
 FAILED = 2  # exit status: bad input, or a run that failed
 DOWN = 3  # exit status of service managers for a service that is not running
-DAMAGED = 1  # exit status: some of the files are damaged
+DAMAGED = 1  # exit status: some of the files are damaged, or data have errors
 LOCAL = "local"  # engine, and `who` in measurements, without a federation
 SETTINGS = {field.name for field in fields(Config)} - {"resume"}
 

@@ -83,16 +83,17 @@ def open_store(
 
 
 def _build(dataset: ReadDataset, image_size: int, folder: Path, progress: bool) -> None:
+    outline = dataset.outline
     np.save(folder / "states.npy", dataset.states)
     np.save(folder / "actions.npy", dataset.actions)
     dataset.episodes.to_json(folder / "episodes.json", orient="records", indent=1)
-    (folder / "store.json").write_text(json.dumps({"fps": dataset.info["fps"], "cameras": list(dataset.cameras)}))
-    total = len(dataset.states) * len(dataset.cameras)
+    (folder / "store.json").write_text(json.dumps({"fps": outline.info["fps"], "cameras": list(outline.cameras)}))
+    total = len(dataset.states) * len(outline.cameras)
     with tqdm(total=total, desc="decoding frames", unit="frame", disable=not progress, leave=False) as bar:
-        for camera, key in dataset.cameras.items():
+        for camera, key in outline.cameras.items():
             shape = (len(dataset.states), image_size, image_size, 3)
             out = np.lib.format.open_memmap(folder / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
-            for row, image in read_images(dataset, key):
+            for row, image in read_images(outline, key):
                 out[row] = fit_square(image, image_size)
                 bar.update()
             out.flush()
