@@ -17,6 +17,8 @@ class Config:
 
     # data
     data: str = ""  # LeRobot data set: a local folder or a hub id; empty records demonstrations and caches them
+    camera_map: str = ""  # which camera of `data` is which of the policy: top=overhead,wrist=front; empty: by name
+    fps: int = 10  # actions of the policy per second; recordings with more frames per second are resampled
     tasks: str = "lift,place,push"  # task names, comma separated; a client is evaluated on the tasks in its own data
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
     image_size: int = 96  # side length of the square camera images, in pixels
@@ -110,13 +112,13 @@ LOCAL_OPTIMIZERS = ("adamw", "sgd", "adamw-shared", "adamw-frozen")
 
 
 POSITIVE = {
-    "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
-    "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg", "validate_every",
-    "round_timeout_s",
+    "episodes_per_task", "image_size", "fps", "num_labs", "num_clients", "num_server_rounds", "min_replies",
+    "chunk_size", "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
+    "validate_every", "round_timeout_s",
 }  # fmt: skip
 MOST = {  # more is a slip of the keyboard, or takes more memory than there is
-    "episodes_per_task": 1e6, "image_size": 4096, "num_labs": 1000, "num_clients": 1e5, "num_server_rounds": 1e6,
-    "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
+    "episodes_per_task": 1e6, "image_size": 4096, "fps": 1000, "num_labs": 1000, "num_clients": 1e5,
+    "num_server_rounds": 1e6, "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
     "round_timeout_s": 1e9, "server_lr": 1e6, "clip_norm": 1e9, "noise": 1e6,
     "epsilon_budget": 1e6, "num_malicious": 1e5, "proximal_mu": 1e6, "dirichlet_alpha": 1e6, "chunk_size": 10_000,
     "n_action_steps": 10_000, "lora_rank": 4096, "local_steps": 1e7, "batch_size": 65_536, "alone_steps": 1e9,

@@ -95,11 +95,12 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
         _flag("--num-labs", "labs to record in, in turn (default: 1)", "N", **GIVEN),
         _flag("--seed", "seed of all episodes", type=int, **GIVEN),
     ]),
-    (inspection.inspect, "check a data set and say how to mend it; exit status 0: no finding is an error, 1: one is, 2: "
-     "the data set cannot be found or has no readable description", NOTHING, [
+    (inspection.inspect, "check a data set and say how to mend it; exit status 0: no finding is an error, 1: one is, "
+     "2: the data set cannot be found or has no readable description", NOTHING, [
         _flag("source", "a folder in LeRobot's format, or a hub id", metavar="DATA"),
         _flag("--reference", "a data set whose calibration and cameras are right, to compare with", "DATA"),
-        _flag("--json", "the file to write findings to as well, for scripts", "FILE"), PROFILE,
+        _flag("--json", "the file to write findings to as well, for scripts", "FILE"),
+        *(setting for setting in _settings() if setting[0] in ("--camera-map", "--fps", "--chunk-size")), PROFILE,
     ]),
     (commands.pretrain, "pretrain the nano base that comes with this package",
      f"episodes and checkpoints are in the cache, {CONTINUES}",

@@ -17,20 +17,24 @@ import numpy as np
 import pandas as pd
 
 from fedvla_lib.config import Config
-from fedvla_lib.data import camera_checks, episode_checks
+from fedvla_lib.data import camera_checks, episode_checks, resampling
 from fedvla_lib.data.camera_checks import SIDE, small
+from fedvla_lib.data.conversion import find
 from fedvla_lib.data.episode_checks import ERROR, NOTE, WARNING, Finding, Remove, Take
 from fedvla_lib.data.lerobot_reader import (
+    FPS_TOLERANCE,
+    Cameras,
     DataError,
     Outline,
     check_rows,
     episode_rows,
-    locate,
+    image_features,
     read_images,
     read_outline,
 )
+from fedvla_lib.data.recordings import camera_names
 from fedvla_lib.data.splits import split
-from fedvla_lib.robot.spec import CAMERAS, FPS, IMAGE_PREFIX
+from fedvla_lib.robot.spec import CAMERAS, IMAGE_PREFIX
 from fedvla_lib.robot.tasks import ALL_TASKS, task_of
 
 SEVERITIES = (ERROR, WARNING, NOTE)  # the worst first
@@ -71,9 +75,9 @@ def inspect(source: str | Path, config: Config, reference: str | Path | None = N
     Raises:
         DataError: the data set, or the reference, cannot be found, or has no readable description.
     """
-    root = locate(source)
-    recorded = read_recorded(root)
-    beside = read_recorded(locate(reference)) if reference else None
+    root, cameras = find(source), camera_names(config)
+    recorded = read_recorded(root, cameras)
+    beside = read_recorded(find(reference), cameras) if reference else None
     found = check(recorded, beside, partial(remove_command, root), edit_command(root)) if recorded.takes else []
     findings = recorded.damaged + found
     counts = Counter(task_of(take.instruction) for take in recorded.takes)
@@ -82,9 +86,9 @@ def inspect(source: str | Path, config: Config, reference: str | Path | None = N
     return Report(findings, dict(counts.most_common()), facts)
 
 
-def read_recorded(root: Path) -> Recorded:
+def read_recorded(root: Path, cameras: Cameras | None = None) -> Recorded:
     """Read a data set, with a finding for each episode or camera that cannot be read; raise DataError if none can."""
-    outline = read_outline(root, None)
+    outline = read_outline(root, cameras)
     instructions = dict(zip(outline.files["episode_index"], outline.files["tasks"], strict=True))
     lengths = outline.files.set_index("episode_index")["length"]
     takes, damaged = {}, []
@@ -148,17 +152,20 @@ def _training(recorded: Recorded, config: Config, counts: Mapping[str, int]) -> 
                           "task": [task_of(take.instruction) for take in recorded.takes]})  # fmt: skip
     held_out = split(table, config.val_fraction, config.seed)[1] if len(table) else []
     frames = sum(len(take.states) for take in recorded.takes)
-    seconds = config.chunk_size / fps
     facts = {
-        "episodes": len(table), "held_out_episodes": len(held_out), "frames": frames, "fps": fps, "policy_fps": FPS,
-        "cameras": names, "chunk_size": config.chunk_size, "chunk_s": seconds,
-        "unknown_tasks": [task for task in counts if task not in ALL_TASKS],
+        "episodes": len(table), "held_out_episodes": len(held_out), "frames": frames, "fps": fps,
+        "policy_fps": config.fps, "cameras": names, "chunk_size": config.chunk_size,
+        "chunk_s": config.chunk_size / config.fps, "unknown_tasks": [task for task in counts if task not in ALL_TASKS],
     }  # fmt: skip
     notes = []
+    if fps < config.fps * (1 - FPS_TOLERANCE):
+        what = f"{fps:g} frames a second, but the policy acts {config.fps} times"
+        notes.append(Finding(ERROR, "fps", what, f"train with --fps {fps:g}"))
+    elif what := resampling.note(fps, config.fps):
+        notes.append(Finding(NOTE, "fps", what, f"--fps {fps:g} for a policy that acts as often"))
     if lacking := [camera for camera in CAMERAS if camera not in names]:
         notes.append(Finding(WARNING, "cameras", f"none for {', '.join(lacking)}: the policy sees the others only"))
-    unused = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    if unused := [key.removeprefix(IMAGE_PREFIX) for key in unused if key not in cameras.values()]:
+    if unused := [key.removeprefix(IMAGE_PREFIX) for key in image_features(info) if key not in cameras.values()]:
         notes.append(Finding(NOTE, "cameras", f"{', '.join(unused)}: not read"))
     if facts["unknown_tasks"]:
         what = f"{len(facts['unknown_tasks'])} instructions are no task of the simulator: no rollouts of them"
@@ -189,7 +196,7 @@ def table(report: Report) -> str:
     cameras = ", ".join(f"camera {name} as {camera}" for camera, name in facts["cameras"].items())
     lines.append(
         f"Training reads {facts['frames']} frames of {facts['episodes']} episodes, {facts['held_out_episodes']} held "
-        f"out, at {facts['fps']} a second (the policy acts {facts['policy_fps']} times a second); {cameras}; "
+        f"out, recorded at {facts['fps']} and used at {facts['policy_fps']} a second; {cameras}; "
         f"a chunk of {facts['chunk_size']} actions lasts {facts['chunk_s']:.2f} s."
     )
     counts = Counter(finding.severity for finding in report.findings)

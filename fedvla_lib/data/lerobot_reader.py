@@ -7,7 +7,7 @@ it yields into arrays.
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -31,6 +31,7 @@ CAMERA_ALIASES = {  # our camera -> names in other data sets, preferred first
     "overhead": ("overhead", "top", "up", "above", "phone"),
     "front": ("front", "side", "wrist", "gripper", "laptop"),
 }
+Cameras = Mapping[str, str | Sequence[str]]  # our camera -> the data set's, or names of which it has one
 TIMESTAMP_TOLERANCE_S = 1e-3
 FPS_TOLERANCE = 0.01  # relative; video containers round frame rates such as 29.97
 
@@ -90,14 +91,14 @@ class ReadDataset:
     actions: np.ndarray
 
 
-def read_outline(root: Path, cameras: Mapping[str, str] | None) -> Outline:
+def read_outline(root: Path, cameras: Cameras | None) -> Outline:
     """Read and check the metadata; raise DataError if it is broken, or not of an SO-100."""
-    info = _read_info(root)
+    info = read_info(root)
     _check_features(root, info)
     return Outline(root, info, _map_cameras(root, info, cameras), _read_episodes(root, info))
 
 
-def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
+def read_dataset(root: Path, cameras: Cameras | None) -> ReadDataset:
     """Read and check everything but the images; raise DataError if it is broken, or not of an SO-100."""
     outline = read_outline(root, cameras)
     states, actions, labs = _read_rows(outline)
@@ -110,7 +111,8 @@ def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
     return ReadDataset(outline, episodes, states, actions)
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def read_info(root: Path) -> dict[str, Any]:
+    """Return the description of a data set; raise DataError if it has none, or is in another format."""
     path = root / "meta/info.json"
     try:
         info = json.loads(path.read_text())
@@ -120,8 +122,8 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DataError(f"{path} is not JSON: {error}") from error
     if info.get("codebase_version") != FORMAT:
         raise DataError(
-            f"{path} says format {info.get('codebase_version')}, this needs {FORMAT}: convert the data set with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
+            f"{path} says format {info.get('codebase_version')}, this reads {FORMAT} and v2.1: convert the data set to "
+            "v2.1 with LeRobot 0.3"
         )
     return info
 
@@ -148,19 +150,31 @@ def _plain(names: Iterable[str]) -> list[str]:
     return [name.removeprefix("main_").removesuffix(".pos") for name in names]
 
 
-def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | None) -> dict[str, str]:
+def _map_cameras(root: Path, info: dict[str, Any], cameras: Cameras | None) -> dict[str, str]:
     """Return our camera -> feature key, from the given mapping or `CAMERA_ALIASES`."""
-    image_features = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    keys = {key.removeprefix(IMAGE_PREFIX): key for key in image_features}
-    wanted = {ours: (name.removeprefix(IMAGE_PREFIX),) for ours, name in cameras.items()} if cameras else CAMERA_ALIASES
-    mapping = {ours: keys[name] for ours, names in wanted.items() for name in reversed(names) if name in keys}
+    keys = {key.removeprefix(IMAGE_PREFIX): key for key in image_features(info)}
+    wanted = {ours: [names] if isinstance(names, str) else names for ours, names in (cameras or CAMERA_ALIASES).items()}
+    mapping, where = {}, root / "meta/info.json"
+    for ours, names in wanted.items():
+        found = [name for name in (each.removeprefix(IMAGE_PREFIX) for each in names) if name in keys]
+        if found and found[0] != ours and len(set(found) - {ours}) > 1:
+            raise DataError(
+                f"{where}: {' and '.join(found)} could each be camera {ours}: say which, for instance "
+                f"camera-map={found[0]}={ours}"
+            )
+        mapping |= {ours: keys[found[0]]} if found else {}
     missing = [ours for ours in wanted if ours not in mapping]
-    if missing and (cameras or len(image_features) >= len(CAMERAS) or not mapping):
+    if missing and (cameras or len(keys) >= len(CAMERAS) or not mapping):
         raise DataError(
-            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: "
-            f"specify it, for instance cameras={{{missing[0]!r}: {next(iter(keys), 'NAME')!r}}}"
+            f"{where}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: "
+            f"specify it, for instance camera-map={next(iter(keys), 'NAME')}={missing[0]}"
         )
     return mapping
+
+
+def image_features(info: dict[str, Any]) -> list[str]:
+    """Return the keys of the cameras in a data set's description."""
+    return [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
 
 
 def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
