@@ -17,6 +17,7 @@ class Config:
 
     # data
     data: str = ""  # LeRobot data set: a local folder or a hub id; empty records demonstrations and caches them
+    client_data: str = ""  # a data set for each client, comma separated; then the server measures on `data`, if given
     camera_map: str = ""  # which camera of `data` is which of the policy: top=overhead,wrist=front; empty: by name
     fps: int = 10  # actions of the policy per second; recordings with more frames per second are resampled
     tasks: str = "lift,place,push"  # task names, comma separated; a client is evaluated on the tasks in its own data
@@ -135,6 +136,8 @@ def from_profile(name: str | None = None, **overrides: Any) -> Config:
         ValueError: unknown profile or setting, or value out of range; the message lists the valid ones.
     """
     name = name or os.environ.get("FEDVLA_PROFILE", "laptop")
+    if owned := split_names(overrides.get("client_data", "")):
+        overrides = {"num_clients": len(owned)} | overrides
     if name not in PROFILES:
         raise ValueError(f"unknown profile {name!r}: choose one of {', '.join(PROFILES)}")
     return from_run_config(PROFILES[name] | _require_known(overrides))
@@ -193,6 +196,10 @@ def check(config: Config) -> Config:
     _require(whole, config, "num_labs", "a multiple of the number of tasks if each lab has one task")
     apart = not config.personal or not config.local_optimizer.startswith("adamw-")
     _require(apart, config, "local_optimizer", "adamw or sgd for a model with personal parts")
+    owned = len(split_names(config.client_data))
+    _require(owned in (0, config.num_clients), config, "num_clients", f"{owned}, one for each data set of client-data")
+    here = config.data or not owned or config.normalisation != "held-out"
+    _require(here, config, "normalisation", "pooled, base or none: the server has no held-out data")
     once = bool(task_names(config)) and len(set(task_names(config))) == len(task_names(config))
     _require(once, config, "tasks", "task names separated by commas, each once")
     _require(DEVICE.fullmatch(config.device) is not None, config, "device", "cpu, cuda, cuda:K or mps")
@@ -257,4 +264,5 @@ def absolute(config: Config) -> Config:
     """Make local paths absolute, since Flower's processes choose their own working directory. Hub ids stay."""
     paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
     local = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
-    return replace(config, out=str(Path(config.out).resolve()), **local)
+    owned = [str(Path(path).resolve()) if Path(path).exists() else path for path in split_names(config.client_data)]
+    return replace(config, out=str(Path(config.out).resolve()), client_data=",".join(owned), **local)

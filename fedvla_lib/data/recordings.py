@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fedvla_lib.config import Config, split_names, task_names
 from fedvla_lib.data import frame_store
-from fedvla_lib.data.lerobot_reader import CAMERA_ALIASES
+from fedvla_lib.data.lerobot_reader import CAMERA_ALIASES, locate
 from fedvla_lib.data.record import record
 from fedvla_lib.files import cache_dir
 from fedvla_lib.provenance import code_digest
@@ -14,14 +14,29 @@ from fedvla_lib.robot.spec import CAMERAS
 
 
 def resolve(config: Config) -> Path | str:
-    """Return the data set of a run: `config.data`, or else a recording in the cache, made if it is missing."""
+    """Return the data set of a run: `config.data`, or else a recording in the cache, made if it is missing.
+
+    Raises:
+        ValueError: only the clients have data.
+    """
     if config.data:
         folder = Path(config.data).expanduser()
         return folder if folder.exists() else config.data
+    if config.client_data:
+        raise ValueError(
+            "client-data has a data set for each client, and data is empty: give data for all, or a client"
+        )
     tasks, counts = task_names(config), [config.image_size, config.episodes_per_task, config.seed]
     key = json.dumps([tasks, *counts, config.num_labs, config.one_task_per_lab, code_digest(record)])
     name = f"{'-'.join(tasks)}_{config.image_size}px_{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     return record_into(cache_dir() / "recordings" / name, config)
+
+
+def with_client_data(config: Config) -> Config:
+    """Return the settings; raise DataError if a client's data set, which has to be on this machine, is missing."""
+    for source in split_names(config.client_data):
+        locate(source)
+    return config
 
 
 def record_into(root: Path, config: Config) -> Path:
