@@ -6,6 +6,7 @@ from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import absolute, from_profile
 from fedvla_lib.data.recordings import resolve
+from fedvla_lib.engines.inline import run_inline
 from fedvla_lib.evaluation.rollouts import tasks_to_roll_out
 from fedvla_lib.federation.client import open_client
 from test_community_data import write_as_a_lab_would
@@ -62,6 +63,14 @@ def test_a_client_reads_its_own_data_set_with_its_own_cameras_and_held_out_episo
         assert len(client.share.train_ids) == len(client.share.val_ids) == 1
     with pytest.raises(ValueError, match="data is empty: give data for all, or a client"):
         resolve(config)
+
+
+@pytest.mark.integration
+def test_nodes_that_name_their_own_folder_need_no_path_in_the_settings(labs, tmp_path):
+    settings = {"base": "nano", "num_server_rounds": 1, "local_steps": 1, "client_rollouts": 0, "out": str(tmp_path)}
+    root = run_inline(from_profile("tiny", client_data="lab a,lab b", **settings), data=labs, progress=False)
+    assert run_folder.read_metrics(root, "train").who.tolist() == ["client_0", "client_1"]
+    assert run_folder.read_metrics(root, "note").detail.str.contains("no rollouts of lift, place, push").all()
 
 
 @pytest.mark.integration

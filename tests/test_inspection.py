@@ -152,24 +152,19 @@ DAMAGE = {
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damaged_arrays_are_found_with_their_mend(healthy, kind):
     change, where, what, mend = DAMAGE[kind]
-    assert not alarms(checked(healthy.takes))
+    assert not alarms(checked(healthy, healthy.takes))
     takes = [replace(take, states=take.states.astype(float)) for take in healthy.takes]
-    found = alarms(checked(change(with_text(takes, 3, takes[0].instruction) if "letters" in kind else takes)))
+    found = alarms(checked(healthy, change(with_text(takes, 3, takes[0].instruction) if "letters" in kind else takes)))
     assert len({finding.where.split(",")[0] for finding in found}) == 1, (
         found
     )  # a turn of 360 degrees is out of range too
     assert re.search(where, found[0].where) and re.search(what, found[0].what) and re.search(mend, found[0].mend)
 
 
-def checked(takes, reference=None):
-    recorded = inspection.Recorded(OUTLINE, takes, {}, [])
-    beside = reference and inspection.Recorded(OUTLINE, reference, {}, [])
-    return inspection.check(recorded, beside, remove, "edit")
-
-
-class OUTLINE:
-    info = {"fps": FPS}
-    cameras = KEYS
+def checked(healthy, takes, reference=None):
+    """What is found in these episodes; their images are left out."""
+    beside = reference and replace(healthy, takes=reference, images={})
+    return inspection.check(replace(healthy, takes=takes, images={}), beside, remove, "edit")
 
 
 @pytest.mark.integration
@@ -182,8 +177,8 @@ class OUTLINE:
 )
 def test_a_shifted_or_turned_joint_is_found_beside_a_reference(healthy, joint, change, what, mend):
     takes = with_joint(healthy.takes, joint, change)
-    assert not alarms(checked(takes)), "nothing tells without a reference"
-    (found,) = alarms(checked(takes, healthy.takes))
+    assert not alarms(checked(healthy, takes)), "nothing tells without a reference"
+    (found,) = alarms(checked(healthy, takes, healthy.takes))
     assert found.severity == ERROR and found.where == "elbow_flex"
     assert re.search(what, found.what) and re.search(mend, found.mend)
 

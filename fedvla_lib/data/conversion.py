@@ -10,10 +10,9 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from fedvla_lib.data.lerobot_reader import DataError, locate
+from fedvla_lib.data.lerobot_reader import OLD_FORMAT, DataError, locate
 from fedvla_lib.files import cache_dir, new_folder
 
-OLD_FORMAT = "v2.1"
 PARTS = ("meta", "data", "videos")  # folders of a data set
 COMMAND = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/data --root=COPY --push-to-hub=false"
 

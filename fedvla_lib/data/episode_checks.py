@@ -11,9 +11,9 @@ import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fedvla_lib.robot.spec import JOINT_NAMES
 from fedvla_lib.robot.tasks import task_of
@@ -25,7 +25,7 @@ NAMES = [name.removesuffix(".pos") for name in JOINT_NAMES]
 LIMITS_DEG = np.array([[-126.1, 126.1], [-90.0, 101.5], [-90.0, 90.0], [-114.6, 103.1], [-180.0, 180.0]])
 LIMIT_MARGIN_DEG = 15.0
 FASTEST = 500.0  # degrees (percent of the gripper) a second; no motor of the arm is as fast
-STILL_S, LEFT_BEHIND = 1.0, 10.0  # a joint that rests so long while its target moves as far is stuck
+STILL, STILL_S, LEFT_BEHIND = 0.3, 1.0, 10.0  # moves by less, for so long, while its target moves so far: stuck
 APART_DEG = 10.0  # usual distance from action to state, beyond which two arms are calibrated differently
 SHIFT_DEG = 3.0  # difference of mean start poses; labs of this book differ by less than 2
 SCATTER_DEG = 8.0  # standard deviation of start poses, above which their mean tells nothing
@@ -103,9 +103,8 @@ def duplicates(takes: Sequence[Take], remove: Remove) -> list[Finding]:
     seen: dict[bytes, int] = {}
     found = {}
     for take in takes:
-        first = seen.setdefault(
-            np.concatenate([take.states, take.actions]).astype(np.float32).tobytes(), take.episode_id
-        )
+        content = np.concatenate([take.states, take.actions]).astype(np.float32).tobytes()
+        first = seen.setdefault(content, take.episode_id)
         if first != take.episode_id:
             found[take.episode_id] = first
     if not found:
@@ -148,10 +147,12 @@ def stuck(takes: Sequence[Take], fps: float, remove: Remove) -> list[Finding]:
     )
 
 
-def _left_behind(state: np.ndarray, action: np.ndarray, least: int) -> float:
-    """Return how far the target moves at most while the state is constant for `least` frames or more."""
-    runs = [list(run) for _, run in groupby(range(len(state)), key=lambda i: float(state[i]))]
-    return max((float(np.ptp(action[run])) for run in runs if len(run) > least), default=0.0)
+def _left_behind(state: np.ndarray, action: np.ndarray, frames: int) -> float:
+    """Return how far the target moves at most while the state rests for so many frames."""
+    if len(state) < frames:
+        return 0.0
+    rests, moves = (np.ptp(sliding_window_view(values, frames), axis=1) for values in (state, action))
+    return float(moves[rests < STILL].max(initial=0.0))
 
 
 def _by_joint(

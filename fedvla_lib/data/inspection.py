@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from tqdm.auto import tqdm
 
 from fedvla_lib.config import Config
 from fedvla_lib.data import camera_checks, episode_checks, resampling
@@ -117,7 +118,7 @@ def read_recorded(root: Path, cameras: Cameras | None = None) -> Recorded:
 
 def _thumbnails(outline: Outline, key: str) -> np.ndarray:
     frames = np.zeros((int(outline.files["length"].sum()), SIDE, SIDE, 3), np.uint8)
-    for row, image in read_images(outline, key):
+    for row, image in tqdm(read_images(outline, key), f"reading {key}", len(frames), leave=False, unit="frame"):
         frames[row] = small(image)
     return frames
 

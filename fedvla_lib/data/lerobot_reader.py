@@ -20,13 +20,14 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from huggingface_hub import snapshot_download
+from huggingface_hub.errors import RevisionNotFoundError
 from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from PIL import Image
 
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.robot.tasks import task_of
 
-FORMAT = "v3.0"  # version of LeRobotDataset
+FORMAT, OLD_FORMAT = "v3.0", "v2.1"  # versions of LeRobotDataset: what is read, and what LeRobot converts to it
 CAMERA_ALIASES = {  # our camera -> names in other data sets, preferred first
     "overhead": ("overhead", "top", "up", "above", "phone"),
     "front": ("front", "side", "wrist", "gripper", "laptop"),
@@ -53,9 +54,12 @@ def locate(source: str | Path) -> Path:
         raise DataError(f"no data set at {source}: give a folder, or a hub id like lerobot/svla_so100_pickplace")
     if (HF_LEROBOT_HOME / source / "meta/info.json").exists():
         return HF_LEROBOT_HOME / source
-    options = {"repo_type": "dataset", "revision": FORMAT, "cache_dir": HF_LEROBOT_HUB_CACHE}
+    options = {"repo_id": str(source), "repo_type": "dataset", "cache_dir": HF_LEROBOT_HUB_CACHE}
     try:
-        return Path(snapshot_download(str(source), **options))
+        try:
+            return Path(snapshot_download(**options, revision=FORMAT))
+        except RevisionNotFoundError:
+            return Path(snapshot_download(**options, revision=OLD_FORMAT))
     except OSError as error:  # of the network, and all errors of the hub
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(
@@ -122,8 +126,8 @@ def read_info(root: Path) -> dict[str, Any]:
         raise DataError(f"{path} is not JSON: {error}") from error
     if info.get("codebase_version") != FORMAT:
         raise DataError(
-            f"{path} says format {info.get('codebase_version')}, this reads {FORMAT} and v2.1: convert the data set to "
-            "v2.1 with LeRobot 0.3"
+            f"{path} says format {info.get('codebase_version')}, this reads {FORMAT} and {OLD_FORMAT}: convert it to "
+            f"{OLD_FORMAT} with LeRobot 0.3"
         )
     return info
 

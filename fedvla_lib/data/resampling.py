@@ -24,7 +24,7 @@ def resampled(dataset: ReadDataset, fps: float) -> tuple[ReadDataset, np.ndarray
     if recorded < fps:
         raise DataError(
             f"{dataset.outline.root} has {recorded:g} frames a second, but the policy acts {fps:g} times: give "
-            f"fps={recorded:g}"
+            f"fps={int(recorded)}"
         )
     rows = [
         start
