@@ -30,6 +30,7 @@ APART_DEG = 10.0  # usual distance from action to state, beyond which two arms a
 SHIFT_DEG = 3.0  # difference of mean start poses; labs of this book differ by less than 2
 SCATTER_DEG = 8.0  # standard deviation of start poses, above which their mean tells nothing
 LOWEST_M = (-0.02, 0.12)  # where the hand is at its lowest, above the table, in a recording on a table
+CLOSE_M = -0.05  # so little below the table may come from zeros that are a few degrees off
 SHORT = 0.25  # of the median length of the episodes of the same task
 MOST_RADIANS = 3.5  # no joint turns by more than about pi
 
@@ -168,7 +169,10 @@ def _by_joint(
 
 
 def units(takes: Sequence[Take]) -> list[Finding]:
-    """Find joints that are not in degrees, and a gripper that is not in percent."""
+    """Find joints that are not in degrees, and a gripper that is not in percent.
+
+    LeRobot's -100..100 cannot be told from degrees where no joint reached an end of its range.
+    """
     values = np.concatenate([*(take.states for take in takes), *(take.actions for take in takes)])
     arm, gripper = values[:, ARM], values[:, -1]
     found = []
@@ -233,8 +237,9 @@ def ranges(takes: Sequence[Take]) -> list[Finding]:
         where = "shoulder_lift, elbow_flex, wrist_flex"
         return [Finding(WARNING, where, f"{what}: a sign, a unit or a zero is off", calibrate)]
     mend = "; or ".join(f"multiply the columns of {name} by -1: then it is {height:.2f} m" for height, name in better)
-    where = " or ".join(name for _, name in better)
-    return [Finding(ERROR, where, f"its sign is turned: {what}", f"{mend} (observation.state and action)")]
+    where, severity = " or ".join(name for _, name in better), WARNING if CLOSE_M < lowest < 0 else ERROR
+    what = f"its sign is turned, or a zero is off: {what}"
+    return [Finding(severity, where, what, f"{mend} (observation.state and action); or {calibrate}")]
 
 
 def lowest_hand_m(states: np.ndarray) -> float:

@@ -95,8 +95,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
         grid = SecureGrid(grid, config, shapes_of(arrays), strategy.records, run.log)
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
-    shown = set(store.episodes.task if store else ()).union(*roster.tasks_of.values())
-    measured = _measured(config, shown, None if saved else run)
+    measured = _measured(config, store, roster, None if saved else run)
     packed = normalisation.pack_stats(stats)
     strategy.start(
         grid,
@@ -158,12 +157,9 @@ class RoundEnd:
         return values
 
 
-def _measured(config: Config, shown: set[str], run: RunFolder | None) -> Config:
-    """Return the settings with the tasks that can be rolled out only; log to a new run why others cannot.
-
-    Args:
-        shown: tasks of the data's episodes.
-    """
+def _measured(config: Config, store: frame_store.FrameStore | None, roster: Roster, run: RunFolder | None) -> Config:
+    """Return the settings with the tasks that can be rolled out only; log to a new run why others cannot."""
+    shown = set(store.episodes.task if store else ()).union(*roster.tasks_of.values())
     tasks, why = tasks_to_roll_out(config, shown)
     if why and run:
         run.log(0, GLOBAL, "note", {"detail": why})
