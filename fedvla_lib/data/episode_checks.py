@@ -25,7 +25,7 @@ NAMES = [name.removesuffix(".pos") for name in JOINT_NAMES]
 LIMITS_DEG = np.array([[-126.1, 126.1], [-90.0, 101.5], [-90.0, 90.0], [-114.6, 103.1], [-180.0, 180.0]])
 LIMIT_MARGIN_DEG = 15.0
 FASTEST = 500.0  # degrees (percent of the gripper) a second; no motor of the arm is as fast
-STILL, STILL_S, LEFT_BEHIND = 0.3, 1.0, 10.0  # moves by less, for so long, while its target moves so far: stuck
+STILL, STILL_S, LEFT_BEHIND = 0.3, 1.0, 5.0  # moves by less, for so long, while its target moves so far: stuck
 APART_DEG = 10.0  # usual distance from action to state, beyond which two arms are calibrated differently
 SHIFT_DEG = 3.0  # difference of mean start poses; labs of this book differ by less than 2
 SCATTER_DEG = 8.0  # standard deviation of start poses, above which their mean tells nothing
@@ -135,10 +135,9 @@ def stuck(takes: Sequence[Take], fps: float, remove: Remove) -> list[Finding]:
     for take in takes:
         for joint, name in enumerate(NAMES):
             state, action = take.states[:, joint], take.actions[:, joint]
-            if name == "gripper":
-                left = float(np.ptp(action)) if np.ptp(state) < 0.02 * np.ptp(action) else 0.0
-            else:
-                left = _left_behind(state, action, round(STILL_S * fps))
+            left = float(np.ptp(action)) if np.ptp(state) < 0.02 * np.ptp(action) else 0.0
+            if name != "gripper":
+                left = max(left, _left_behind(state, action, round(STILL_S * fps)))
             if left > LEFT_BEHIND:
                 found[joint, take.episode_id] = left
     return _by_joint(

@@ -201,5 +201,5 @@ def table(report: Report) -> str:
         f"a chunk of {facts['chunk_size']} actions lasts {facts['chunk_s']:.2f} s."
     )
     counts = Counter(finding.severity for finding in report.findings)
-    lines.append(", ".join(f"{counts[severity]} {severity}s" for severity in SEVERITIES))
+    lines.append(", ".join(f"{counts[severity]} {severity}{'s' * (counts[severity] != 1)}" for severity in SEVERITIES))
     return "\n".join(lines)
