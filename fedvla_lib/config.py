@@ -17,6 +17,9 @@ class Config:
 
     # data
     data: str = ""  # LeRobot data set: a local folder or a hub id; empty records demonstrations and caches them
+    client_data: str = ""  # a data set for each client, comma separated; then the server measures on `data`, if given
+    camera_map: str = ""  # which camera of `data` is which of the policy: top=overhead,wrist=front; empty: by name
+    fps: int = 10  # actions of the policy per second; recordings with more frames per second are resampled
     tasks: str = "lift,place,push"  # task names, comma separated; a client is evaluated on the tasks in its own data
     episodes_per_task: int = 40  # demonstrations recorded per task when `data` is empty
     image_size: int = 96  # side length of the square camera images, in pixels
@@ -110,13 +113,13 @@ LOCAL_OPTIMIZERS = ("adamw", "sgd", "adamw-shared", "adamw-frozen")
 
 
 POSITIVE = {
-    "episodes_per_task", "image_size", "num_labs", "num_clients", "num_server_rounds", "min_replies", "chunk_size",
-    "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg", "validate_every",
-    "round_timeout_s",
+    "episodes_per_task", "image_size", "fps", "num_labs", "num_clients", "num_server_rounds", "min_replies",
+    "chunk_size", "n_action_steps", "local_steps", "batch_size", "lr", "dirichlet_alpha", "action_tolerance_deg",
+    "validate_every", "round_timeout_s",
 }  # fmt: skip
 MOST = {  # more is a slip of the keyboard, or takes more memory than there is
-    "episodes_per_task": 1e6, "image_size": 4096, "num_labs": 1000, "num_clients": 1e5, "num_server_rounds": 1e6,
-    "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
+    "episodes_per_task": 1e6, "image_size": 4096, "fps": 1000, "num_labs": 1000, "num_clients": 1e5,
+    "num_server_rounds": 1e6, "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
     "round_timeout_s": 1e9, "server_lr": 1e6, "clip_norm": 1e9, "noise": 1e6,
     "epsilon_budget": 1e6, "num_malicious": 1e5, "proximal_mu": 1e6, "dirichlet_alpha": 1e6, "chunk_size": 10_000,
     "n_action_steps": 10_000, "lora_rank": 4096, "local_steps": 1e7, "batch_size": 65_536, "alone_steps": 1e9,
@@ -133,6 +136,8 @@ def from_profile(name: str | None = None, **overrides: Any) -> Config:
         ValueError: unknown profile or setting, or value out of range; the message lists the valid ones.
     """
     name = name or os.environ.get("FEDVLA_PROFILE", "laptop")
+    if owned := split_names(overrides.get("client_data", "")):
+        overrides = {"num_clients": len(owned)} | overrides
     if name not in PROFILES:
         raise ValueError(f"unknown profile {name!r}: choose one of {', '.join(PROFILES)}")
     return from_run_config(PROFILES[name] | _require_known(overrides))
@@ -191,6 +196,10 @@ def check(config: Config) -> Config:
     _require(whole, config, "num_labs", "a multiple of the number of tasks if each lab has one task")
     apart = not config.personal or not config.local_optimizer.startswith("adamw-")
     _require(apart, config, "local_optimizer", "adamw or sgd for a model with personal parts")
+    owned = len(split_names(config.client_data))
+    _require(owned in (0, config.num_clients), config, "num_clients", f"{owned}, one for each data set of client-data")
+    here = config.data or not owned or config.normalisation != "held-out"
+    _require(here, config, "normalisation", "pooled, base or none: the server has no held-out data")
     once = bool(task_names(config)) and len(set(task_names(config))) == len(task_names(config))
     _require(once, config, "tasks", "task names separated by commas, each once")
     _require(DEVICE.fullmatch(config.device) is not None, config, "device", "cpu, cuda, cuda:K or mps")
@@ -255,4 +264,5 @@ def absolute(config: Config) -> Config:
     """Make local paths absolute, since Flower's processes choose their own working directory. Hub ids stay."""
     paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
     local = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
-    return replace(config, out=str(Path(config.out).resolve()), **local)
+    owned = [str(Path(path).resolve()) if Path(path).exists() else path for path in split_names(config.client_data)]
+    return replace(config, out=str(Path(config.out).resolve()), client_data=",".join(owned), **local)

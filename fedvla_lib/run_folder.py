@@ -210,7 +210,7 @@ def read_metrics(root: Path, kind: str | None = None) -> pd.DataFrame:
 
     Args:
         kind: return only events of this kind, and only the columns they use: ``train``, ``evaluate``, ``rollout``,
-            ``replies`` or ``rejected``.
+            ``replies``, ``rejected`` or ``note``.
 
     Raises:
         ValueError: not a run folder, or a line of ``metrics.jsonl`` is not an event.

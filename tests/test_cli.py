@@ -24,7 +24,7 @@ from fedvla_lib.engines import inline
 from fedvla_lib.evaluation.statistics import P_VALUES
 from fedvla_lib.files import write_json
 
-COMMANDS = ["doctor", "record", "pretrain", "experts", "config", "train", "run", "evaluate"]
+COMMANDS = ["doctor", "record", "inspect", "pretrain", "experts", "config", "train", "run", "evaluate"]
 
 
 @pytest.mark.unit

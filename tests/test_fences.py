@@ -41,11 +41,12 @@ FENCES = {
     "torch": {
         "policy.actor", "policy.lean_expert", "policy.lora", "policy.model", "policy.optimizers", "policy.parameters",
         "policy.prefix_cache", "policy.training",
-        "data.augmentation", "data.batches", "evaluation.held_out", "pretraining.grounding",
+        "data.augmentation", "data.batches", "data.frame_store", "evaluation.held_out", "pretraining.grounding",
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },
     "lerobot": {
-        "robot.lerobot_env", "data.episode_writer", "data.lerobot_reader", "data.normalisation",
+        "robot.lerobot_env", "data.conversion", "data.episode_writer", "data.frame_store", "data.lerobot_reader",
+        "data.normalisation",
         "policy.lean_expert", "policy.model", "policy.prefix_cache", "policy.training",
     },
     "transformers": {"policy.prefix_cache"},

@@ -342,8 +342,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         rf"{ROWS}, episode 5: action of frame 3 is nan at gripper.pos",
     ),
     "older format": (
-        lambda root: edit_info(root, lambda info: info.update(codebase_version="v2.1")),
-        r"meta/info\.json says format v2\.1, this needs v3\.0",
+        lambda root: edit_info(root, lambda info: info.update(codebase_version="v2.0")),
+        r"meta/info\.json says format v2\.0, this reads v3\.0 and v2\.1",
     ),
     "description cut off": (
         lambda root: os.truncate(root / "meta/info.json", 100),

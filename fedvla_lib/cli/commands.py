@@ -19,7 +19,7 @@ from fedvla_lib.robot.tasks import TASKS, check_tasks
 
 FAILED = 2  # exit status: bad input, or a run that failed
 DOWN = 3  # exit status of service managers for a service that is not running
-DAMAGED = 1  # exit status: some of the files are damaged
+DAMAGED = 1  # exit status: some of the files are damaged, or data have errors
 LOCAL = "local"  # engine, and `who` in measurements, without a federation
 SETTINGS = {field.name for field in fields(Config)} - {"resume"}
 
@@ -109,7 +109,7 @@ def _trained_on(options: argparse.Namespace, chosen: Config) -> tuple[int | None
 
 def _train_into(folder: Any, chosen: Config, client: int | None, steps: int) -> None:
     from fedvla_lib.evaluation.measure import log_measurement, measure
-    from fedvla_lib.evaluation.rollouts import rollout_seeds
+    from fedvla_lib.evaluation.rollouts import rollout_seeds, tasks_to_roll_out
     from fedvla_lib.experiments.methods import train_alone
     from fedvla_lib.federation.client import open_client, open_pooled
     from fedvla_lib.policy.model import load_policy, save_policy
@@ -120,8 +120,9 @@ def _train_into(folder: Any, chosen: Config, client: int | None, steps: int) -> 
     checkpoints = Checkpoints(folder.root / "checkpoints", resume=bool(chosen.resume))
     result = train_alone(bundle, learner, steps=steps, checkpoints=checkpoints)
     save_policy(bundle, folder.root / "model")
+    tasks, why = tasks_to_roll_out(chosen, set(learner.store.episodes.task))
     found = measure(
-        bundle, learner.store, chosen, seeds=rollout_seeds(chosen.eval_rollouts),
+        bundle, learner.store, replace(chosen, tasks=",".join(tasks)), seeds=rollout_seeds(chosen.eval_rollouts),
         videos_dir=folder.videos_dir(0, LOCAL), progress=True,
     )  # fmt: skip
     log_measurement(folder, 0, LOCAL, found)
@@ -129,7 +130,7 @@ def _train_into(folder: Any, chosen: Config, client: int | None, steps: int) -> 
     folder.log(0, LOCAL, "evaluate", {"gradient_steps": result.steps, "num_examples": found.num_examples} | measured)
     print(f"{result.steps} steps in {result.seconds:.0f} s, last loss {result.losses[-1]:.3f}")
     print(f"on {found.num_examples} held-out frames: " + ", ".join(f"{k} {v:.3f}" for k, v in measured.items()))
-    print(folder.root / "model")
+    print(*filter(None, [why, folder.root / "model"]), sep="\n")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -153,10 +154,11 @@ def _new_or_resumed(options: argparse.Namespace, of_train: bool = False) -> Conf
     Raises:
         ValueError: the run cannot be resumed, or a setting that changes results was given with ``--resume``.
     """
+    from fedvla_lib.data.recordings import with_client_data
     from fedvla_lib.run_folder import hold, read_config, resumable
 
     if not options.resume:
-        return settings(options)
+        return with_client_data(settings(options))
     if given := sorted((SETTINGS - {"num_threads"}) & set(vars(options))):
         raise ValueError(f"--{given[0].replace('_', '-')} cannot be given with --resume: a run keeps its settings")
     if not (options.resume / "config.json").is_file():
@@ -210,11 +212,14 @@ def credentials(options: argparse.Namespace) -> None:
 
 
 def _print_rounds(folder: Path) -> None:
-    from fedvla_lib.run_folder import read_metrics
+    from fedvla_lib.run_folder import read_config, read_metrics
 
-    rounds = read_metrics(folder, kind="evaluate")
-    _print_table(rounds[rounds.who == "global"].drop(columns=["who", "kind", "time"]))
-    print(folder)
+    rounds = read_metrics(folder, kind="evaluate").drop(columns=["kind", "time"])
+    _print_table(rounds[rounds.who == "global"].drop(columns="who").dropna(axis="columns", how="all"))
+    if read_config(folder).client_data:  # each measures the global model on its own held-out episodes
+        clients = rounds[(rounds.who != "global") & (rounds["round"] == rounds["round"].max())]
+        _print_table(clients.dropna(axis="columns", how="all"))
+    print(*read_metrics(folder, kind="note").get("detail", []), folder, sep="\n")
 
 
 def experiment(options: argparse.Namespace) -> None:

@@ -7,11 +7,11 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-from fedvla_lib.cli import commands
+from fedvla_lib.cli import commands, inspection
 from fedvla_lib.config import PROFILES, Config
 from fedvla_lib.pretraining.recipe import Recipe
 
-TYPES = {"N": int, "K": int, "PIXELS": int, "DIR": Path, "RUN": Path, "RUN_FOLDER": Path}  # by metavar
+TYPES = {"N": int, "K": int, "PIXELS": int, "DIR": Path, "RUN": Path, "RUN_FOLDER": Path, "FILE": Path}  # by metavar
 CONTINUES = "the same command continues"
 NOTHING, ROUNDS = "nothing was written", "completed rounds are in the run folder"  # what is kept after Ctrl-C
 Flag = tuple[str, dict[str, Any]]  # arguments of `add_argument`
@@ -94,6 +94,13 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
         _flag("--image-size", "side length of the square camera images", "PIXELS", **GIVEN),
         _flag("--num-labs", "labs to record in, in turn (default: 1)", "N", **GIVEN),
         _flag("--seed", "seed of all episodes", type=int, **GIVEN),
+    ]),
+    (inspection.inspect, "check a data set and say how to mend it; exit status 0: no finding is an error, 1: one is, "
+     "2: the data set cannot be found or has no readable description", NOTHING, [
+        _flag("source", "a folder in LeRobot's format, or a hub id", metavar="DATA"),
+        _flag("--reference", "a data set whose calibration and cameras are right, to compare with", "DATA"),
+        _flag("--json", "the file to write findings to as well, for scripts", "FILE"),
+        *(setting for setting in _settings() if setting[0] in ("--camera-map", "--fps", "--chunk-size")), PROFILE,
     ]),
     (commands.pretrain, "pretrain the nano base that comes with this package",
      f"episodes and checkpoints are in the cache, {CONTINUES}",

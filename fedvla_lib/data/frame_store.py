@@ -5,10 +5,9 @@ frame many times. `open_store` therefore reads and checks a data set once, write
 and later only maps the files. This module knows neither the data set's file format nor batches.
 """
 
-import hashlib
 import json
+import logging
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,13 +15,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from filelock import FileLock
-from PIL import Image, ImageOps
 from tqdm.auto import tqdm
 
-from fedvla_lib.data.lerobot_reader import ReadDataset, locate, read_dataset, read_images
+from fedvla_lib.data import conversion, resampling
+from fedvla_lib.data.lerobot_reader import Cameras, Outline, ReadDataset, read_dataset, read_images, read_info
+from fedvla_lib.data.resampling import resampled
 from fedvla_lib.files import cache_dir, new_folder
+from fedvla_lib.robot.spec import IMAGE_PREFIX
 
-STORE_VERSION = 2  # part of every store's key; increase it when the file format of a store changes
+logger = logging.getLogger(__name__)
+STORE_VERSION = 3  # part of every store's key; increase it when the file format of a store changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,7 @@ class FrameStore:
     """All frames of a data set, episode after episode; row i of every array is the same frame."""
 
     root: Path  # the data set's folder
-    fps: int  # frames per second
+    fps: float  # frames per second
     states: np.ndarray  # float32 (N, 6): joint positions, LeRobot units
     actions: np.ndarray  # float32 (N, 6): joint targets, LeRobot units
     images: dict[str, np.ndarray]  # camera -> uint8 (N, size, size, 3), memory-mapped, read-only
@@ -53,22 +55,24 @@ class FrameStore:
 
 
 def open_store(
-    source: str | Path, *, image_size: int, cameras: Mapping[str, str] | None = None, progress: bool = True
-) -> FrameStore:
+    source: str | Path, *, image_size: int, cameras: Cameras | None = None, fps: int | None = None,
+    progress: bool = True,
+) -> FrameStore:  # fmt: skip
     """Open a data set, decoding its frames into the cache the first time.
 
     Args:
-        source: a folder in LeRobotDataset v3.0 format, or a hub id such as ``lerobot/svla_so100_pickplace``.
-        image_size: side of the square images in pixels; other sizes are scaled with their aspect ratio kept, and
-            padded with black.
-        cameras: our camera name -> the data set's, e.g. ``{"front": "wrist"}``; None uses `CAMERA_ALIASES`.
+        source: a folder in LeRobotDataset format v3.0 or v2.1, or a hub id such as ``lerobot/svla_so100_pickplace``.
+        image_size: side of the square images in pixels; others are resized by `fit_square`.
+        cameras: our camera -> the data set's, e.g. ``{"front": "wrist"}``; None uses `CAMERA_ALIASES`.
+        fps: frames per second that the policy needs; None keeps those of the recording. See `resampling`.
         progress: show a progress bar while decoding.
 
     Raises:
         DataError: the data set cannot be found or is broken.
     """
-    root = locate(source)
-    key = _fingerprint(root, image_size, cameras)
+    root = conversion.find(source)
+    fps = fps or read_info(root)["fps"]
+    key = conversion.fingerprint(root, STORE_VERSION, image_size, cameras or {}, fps)
     folder = cache_dir() / "frames" / key
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -78,28 +82,41 @@ def open_store(
                     shutil.rmtree(left)
                 dataset = read_dataset(root, cameras)
                 with new_folder(folder) as draft:
-                    _build(dataset, image_size, draft, progress)
+                    _build(dataset, image_size, fps, draft, progress)
     return _load(root, folder)
 
 
-def _build(dataset: ReadDataset, image_size: int, folder: Path, progress: bool) -> None:
+def _build(dataset: ReadDataset, image_size: int, fps: float, folder: Path, progress: bool) -> None:
+    outline, (dataset, kept) = dataset.outline, resampled(dataset, fps)
+    place = dict(zip(kept.tolist(), range(len(kept)), strict=True))
     np.save(folder / "states.npy", dataset.states)
     np.save(folder / "actions.npy", dataset.actions)
     dataset.episodes.to_json(folder / "episodes.json", orient="records", indent=1)
-    (folder / "store.json").write_text(json.dumps({"fps": dataset.info["fps"], "cameras": list(dataset.cameras)}))
-    total = len(dataset.states) * len(dataset.cameras)
+    content = {"fps": fps, "cameras": list(outline.cameras), "notes": _notes(outline, fps)}
+    (folder / "store.json").write_text(json.dumps(content))
+    total = len(dataset.states) * len(outline.cameras)
     with tqdm(total=total, desc="decoding frames", unit="frame", disable=not progress, leave=False) as bar:
-        for camera, key in dataset.cameras.items():
+        for camera, key in outline.cameras.items():
             shape = (len(dataset.states), image_size, image_size, 3)
             out = np.lib.format.open_memmap(folder / f"{camera}.npy", mode="w+", dtype=np.uint8, shape=shape)
-            for row, image in read_images(dataset, key):
-                out[row] = fit_square(image, image_size)
-                bar.update()
+            for row, image in read_images(outline, key):
+                if row in place:
+                    out[place[row]] = fit_square(image, image_size)
+                    bar.update()
             out.flush()
+
+
+def _notes(outline: Outline, fps: float) -> list[str]:
+    """Return what is done to the data set that a reader may not expect; shown each time that it is opened."""
+    names = {camera: key.removeprefix(IMAGE_PREFIX) for camera, key in outline.cameras.items()}
+    others = [f"camera {name} is used as {camera}" for camera, name in names.items() if name != camera]
+    return [note for note in (resampling.note(outline.info["fps"], fps), ", ".join(others)) if note]
 
 
 def _load(root: Path, folder: Path) -> FrameStore:
     content = json.loads((folder / "store.json").read_text())
+    for note in content["notes"]:
+        logger.warning("%s: %s", root.name, note)
     return FrameStore(
         root=root, fps=content["fps"], states=np.load(folder / "states.npy"), actions=np.load(folder / "actions.npy"),
         images={camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in content["cameras"]},
@@ -107,16 +124,15 @@ def _load(root: Path, folder: Path) -> FrameStore:
     )  # fmt: skip
 
 
-def _fingerprint(root: Path, image_size: int, cameras: Mapping[str, str] | None) -> str:
-    """Return the name of a store: a hash of the data set's files (name, size, time), the image size and the cameras."""
-    paths = sorted(path for part in ("meta", "data", "videos") for path in (root / part).rglob("*") if path.is_file())
-    files = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
-    content = json.dumps([STORE_VERSION, image_size, dict(cameras or {}), files])
-    return hashlib.sha256(content.encode()).hexdigest()[:24]
-
-
 def fit_square(image: np.ndarray, size: int) -> np.ndarray:
-    """Return uint8 (H, W, 3) as uint8 (size, size, 3): scaled with its aspect ratio kept, centred on black."""
+    """Return uint8 (H, W, 3) as uint8 (size, size, 3): resized and padded as SmolVLA does, left and above, with black.
+
+    So a policy that was trained on these images sees the same ones where it is given a camera's own.
+    """
     if image.shape[:2] == (size, size):
         return image
-    return np.asarray(ImageOps.pad(Image.fromarray(image), (size, size), Image.Resampling.BILINEAR))
+    import torch
+    from lerobot.policies.common.vla_utils import resize_with_pad  # here, since recordings of this size do without
+
+    pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+    return resize_with_pad(pixels, size, size, pad_value=0)[0].permute(1, 2, 0).round().byte().numpy()

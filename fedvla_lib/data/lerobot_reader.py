@@ -7,7 +7,7 @@ it yields into arrays.
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -20,17 +20,19 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from huggingface_hub import snapshot_download
+from huggingface_hub.errors import RevisionNotFoundError
 from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from PIL import Image
 
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.robot.tasks import task_of
 
-FORMAT = "v3.0"  # version of LeRobotDataset
+FORMAT, OLD_FORMAT = "v3.0", "v2.1"  # versions of LeRobotDataset: what is read, and what LeRobot converts to it
 CAMERA_ALIASES = {  # our camera -> names in other data sets, preferred first
     "overhead": ("overhead", "top", "up", "above", "phone"),
     "front": ("front", "side", "wrist", "gripper", "laptop"),
 }
+Cameras = Mapping[str, str | Sequence[str]]  # our camera -> the data set's, or names of which it has one
 TIMESTAMP_TOLERANCE_S = 1e-3
 FPS_TOLERANCE = 0.01  # relative; video containers round frame rates such as 29.97
 
@@ -52,9 +54,12 @@ def locate(source: str | Path) -> Path:
         raise DataError(f"no data set at {source}: give a folder, or a hub id like lerobot/svla_so100_pickplace")
     if (HF_LEROBOT_HOME / source / "meta/info.json").exists():
         return HF_LEROBOT_HOME / source
-    options = {"repo_type": "dataset", "revision": FORMAT, "cache_dir": HF_LEROBOT_HUB_CACHE}
+    options = {"repo_id": str(source), "repo_type": "dataset", "cache_dir": HF_LEROBOT_HUB_CACHE}
     try:
-        return Path(snapshot_download(str(source), **options))
+        try:
+            return Path(snapshot_download(**options, revision=FORMAT))
+        except RevisionNotFoundError:
+            return Path(snapshot_download(**options, revision=OLD_FORMAT))
     except OSError as error:  # of the network, and all errors of the hub
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(
@@ -65,34 +70,53 @@ def locate(source: str | Path) -> Path:
 
 
 @dataclass(frozen=True, eq=False)
-class ReadDataset:
-    """The checked metadata and rows of a data set, without its images."""
+class Outline:
+    """The checked metadata of a data set."""
 
     root: Path
     info: dict[str, Any]  # meta/info.json
     cameras: dict[str, str]  # our camera -> feature key
     files: pd.DataFrame  # meta/episodes: the files of each episode, and its position in them
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Row at which each episode begins in the arrays of the data set, int64 (episodes,)."""
+        lengths = self.files["length"].to_numpy()
+        return np.cumsum(lengths) - lengths
+
+
+@dataclass(frozen=True, eq=False)
+class ReadDataset:
+    """The checked metadata and rows of a data set, without its images."""
+
+    outline: Outline
     episodes: pd.DataFrame  # this and the arrays as in `FrameStore`
     states: np.ndarray
     actions: np.ndarray
 
 
-def read_dataset(root: Path, cameras: Mapping[str, str] | None) -> ReadDataset:
-    """Read and check everything but the images; raise DataError if it is broken, or not of an SO-100."""
-    info = _read_info(root)
+def read_outline(root: Path, cameras: Cameras | None) -> Outline:
+    """Read and check the metadata; raise DataError if it is broken, or not of an SO-100."""
+    info = read_info(root)
     _check_features(root, info)
-    files = _read_episodes(root, info)
-    states, actions, labs = _read_rows(root, info, files)
-    lengths, ids = files["length"].to_numpy(), files["episode_index"].astype(int)
-    ends = np.cumsum(lengths)
-    episodes = pd.DataFrame({"episode_id": ids, "start": ends - lengths, "end": ends, "num_frames": lengths})
-    episodes["instruction"] = [tasks[0] for tasks in files["tasks"]]
+    return Outline(root, info, _map_cameras(root, info, cameras), _read_episodes(root, info))
+
+
+def read_dataset(root: Path, cameras: Cameras | None) -> ReadDataset:
+    """Read and check everything but the images; raise DataError if it is broken, or not of an SO-100."""
+    outline = read_outline(root, cameras)
+    states, actions, labs = _read_rows(outline)
+    lengths, ids = outline.files["length"].to_numpy(), outline.files["episode_index"].astype(int)
+    ends = outline.starts + lengths
+    episodes = pd.DataFrame({"episode_id": ids, "start": outline.starts, "end": ends, "num_frames": lengths})
+    episodes["instruction"] = [tasks[0] for tasks in outline.files["tasks"]]
     episodes["task"] = [task_of(text) for text in episodes["instruction"]]
     episodes["lab"] = labs
-    return ReadDataset(root, info, _map_cameras(root, info, cameras), files, episodes, states, actions)
+    return ReadDataset(outline, episodes, states, actions)
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def read_info(root: Path) -> dict[str, Any]:
+    """Return the description of a data set; raise DataError if it has none, or is in another format."""
     path = root / "meta/info.json"
     try:
         info = json.loads(path.read_text())
@@ -102,8 +126,8 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DataError(f"{path} is not JSON: {error}") from error
     if info.get("codebase_version") != FORMAT:
         raise DataError(
-            f"{path} says format {info.get('codebase_version')}, this needs {FORMAT}: convert the data set with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
+            f"{path} says format {info.get('codebase_version')}, this reads {FORMAT} and {OLD_FORMAT}: convert it to "
+            f"{OLD_FORMAT} with LeRobot 0.3"
         )
     return info
 
@@ -130,19 +154,31 @@ def _plain(names: Iterable[str]) -> list[str]:
     return [name.removeprefix("main_").removesuffix(".pos") for name in names]
 
 
-def _map_cameras(root: Path, info: dict[str, Any], cameras: Mapping[str, str] | None) -> dict[str, str]:
+def _map_cameras(root: Path, info: dict[str, Any], cameras: Cameras | None) -> dict[str, str]:
     """Return our camera -> feature key, from the given mapping or `CAMERA_ALIASES`."""
-    image_features = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    keys = {key.removeprefix(IMAGE_PREFIX): key for key in image_features}
-    wanted = {ours: (name.removeprefix(IMAGE_PREFIX),) for ours, name in cameras.items()} if cameras else CAMERA_ALIASES
-    mapping = {ours: keys[name] for ours, names in wanted.items() for name in reversed(names) if name in keys}
+    keys = {key.removeprefix(IMAGE_PREFIX): key for key in image_features(info)}
+    wanted = {ours: [names] if isinstance(names, str) else names for ours, names in (cameras or CAMERA_ALIASES).items()}
+    mapping, where = {}, root / "meta/info.json"
+    for ours, names in wanted.items():
+        found = [name for name in (each.removeprefix(IMAGE_PREFIX) for each in names) if name in keys]
+        if found and found[0] != ours and len(set(found) - {ours}) > 1:
+            raise DataError(
+                f"{where}: {' and '.join(found)} could each be camera {ours}: say which, for instance "
+                f"camera-map={found[0]}={ours}"
+            )
+        mapping |= {ours: keys[found[0]]} if found else {}
     missing = [ours for ours in wanted if ours not in mapping]
-    if missing and (cameras or len(image_features) >= len(CAMERAS) or not mapping):
+    if missing and (cameras or len(keys) >= len(CAMERAS) or not mapping):
         raise DataError(
-            f"{root / 'meta/info.json'}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: "
-            f"specify it, for instance cameras={{{missing[0]!r}: {next(iter(keys), 'NAME')!r}}}"
+            f"{where}: no camera for {', '.join(missing)} among {', '.join(keys) or 'none'}: "
+            f"specify it, for instance camera-map={next(iter(keys), 'NAME')}={missing[0]}"
         )
     return mapping
+
+
+def image_features(info: dict[str, Any]) -> list[str]:
+    """Return the keys of the cameras in a data set's description."""
+    return [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
 
 
 def _read_episodes(root: Path, info: dict[str, Any]) -> pd.DataFrame:
@@ -169,10 +205,10 @@ def _parquet(path: Path, episodes: Any) -> pq.ParquetFile:
         raise DataError(f"{path} cannot be read (episode {episodes}): {error}") from error
 
 
-def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return checked states and actions of all episodes, float32 (N, 6) each, and the lab of each episode."""
+def episode_rows(outline: Outline) -> Iterator[tuple[str, int, pd.DataFrame]]:
+    """Yield file and name, number, and rows (times, states, actions, lab) of each episode, by file; not checked yet."""
+    root, info, files = outline.root, outline.info, outline.files
     columns = ["episode_index", "timestamp", STATE_KEY, ACTION_KEY, *([LAB_KEY] if LAB_KEY in info["features"] else [])]
-    parts: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for (chunk, file), group in files.groupby(["data/chunk_index", "data/file_index"]):
         first_id = group["episode_index"].iloc[0]
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
@@ -180,26 +216,41 @@ def _read_rows(root: Path, info: dict[str, Any], files: pd.DataFrame) -> tuple[n
         if lacking := [name for name in columns if name not in parquet.schema_arrow.names]:
             raise DataError(f"{path} (episode {first_id}) has no column {', '.join(lacking)}")
         table = parquet.read(columns=columns).to_pandas()
-        for episode_id, length in zip(group["episode_index"], group["length"], strict=True):
-            rows = table[table["episode_index"] == episode_id]
-            checked = _check_rows(f"{path}, episode {episode_id}", rows, length, info["fps"])
-            parts[episode_id] = (*checked, int(rows[LAB_KEY].iloc[0]) if LAB_KEY in rows else 0)
-    states, actions, labs = zip(*(parts[episode_id] for episode_id in files["episode_index"]), strict=True)
+        for episode_id in group["episode_index"]:
+            yield f"{path}, episode {episode_id}", episode_id, table[table["episode_index"] == episode_id]
+
+
+def _read_rows(outline: Outline) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Return checked states and actions of all episodes, float32 (N, 6) each, and the lab of each episode."""
+    lengths = outline.files.set_index("episode_index")["length"]
+    parts: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
+    for episode, episode_id, rows in episode_rows(outline):
+        states, actions = check_rows(episode, rows, lengths[episode_id])
+        _check_times(episode, rows["timestamp"].to_numpy(), outline.info["fps"])
+        parts[episode_id] = (states, actions, int(rows[LAB_KEY].iloc[0]) if LAB_KEY in rows else 0)
+    states, actions, labs = zip(*(parts[episode_id] for episode_id in outline.files["episode_index"]), strict=True)
     return np.concatenate(states), np.concatenate(actions), list(labs)
 
 
-def _check_rows(episode: str, rows: pd.DataFrame, length: int, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return states and actions of one episode, float32 (T, 6)."""
+def check_rows(episode: str, rows: pd.DataFrame, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and actions of one episode, float32 (T, 6); raise DataError, naming `episode`, if they cannot be.
+
+    Args:
+        length: number of frames that the metadata states.
+    """
     if len(rows) != length:
         raise DataError(f"{episode}: has {len(rows)} frames, its metadata says {length}")
-    drift = np.abs(rows["timestamp"].to_numpy() - np.arange(length) / fps)
-    if drift.max() > max(TIMESTAMP_TOLERANCE_S, 1e-6 * length):
+    return _vectors(episode, STATE_KEY, rows[STATE_KEY]), _vectors(episode, ACTION_KEY, rows[ACTION_KEY])
+
+
+def _check_times(episode: str, times_s: np.ndarray, fps: float) -> None:
+    drift = np.abs(times_s - np.arange(len(times_s)) / fps)
+    if drift.max() > max(TIMESTAMP_TOLERANCE_S, 1e-6 * len(times_s)):
         frame = int(np.argmax(drift > TIMESTAMP_TOLERANCE_S))
         raise DataError(
-            f"{episode}: frame {frame} is at {rows['timestamp'].iloc[frame]:.4f} s, but at fps={fps} "
+            f"{episode}: frame {frame} is at {times_s[frame]:.4f} s, but at fps={fps} "
             f"it should be at {frame / fps:.4f} s"
         )
-    return _vectors(episode, STATE_KEY, rows[STATE_KEY]), _vectors(episode, ACTION_KEY, rows[ACTION_KEY])
 
 
 def _vectors(episode: str, key: str, column: pd.Series) -> np.ndarray:
@@ -215,14 +266,14 @@ def _vectors(episode: str, key: str, column: pd.Series) -> np.ndarray:
     return values
 
 
-def read_images(dataset: ReadDataset, key: str) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each frame of one camera once: store row, uint8 (H, W, 3); raise DataError if a file is damaged or gone."""
-    info, starts = dataset.info, dataset.episodes["start"].to_numpy()
+def read_images(outline: Outline, key: str) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield each frame of one camera once: row, uint8 (H, W, 3); raise DataError if a file is damaged or gone."""
+    info, starts = outline.info, outline.starts
     kind, pattern, read = "data", "data_path", _still_images
     if info["features"][key]["dtype"] == "video":
         kind, pattern, read = f"videos/{key}", "video_path", _video_images
-    for (chunk, file), group in dataset.files.groupby([f"{kind}/chunk_index", f"{kind}/file_index"]):
-        path = dataset.root / info[pattern].format(video_key=key, chunk_index=chunk, file_index=file)
+    for (chunk, file), group in outline.files.groupby([f"{kind}/chunk_index", f"{kind}/file_index"]):
+        path = outline.root / info[pattern].format(video_key=key, chunk_index=chunk, file_index=file)
         yield from read(path, key, group, starts[group.index], info["fps"])
 
 

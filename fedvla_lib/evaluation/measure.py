@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, task_names
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.data.splits import held_out_episodes
 from fedvla_lib.evaluation.held_out import average, by_episode, held_out_batches, measure_frames
@@ -41,22 +41,23 @@ class Measurement:
 
 
 def measure(
-    bundle: Bundle, store: FrameStore, config: Config, *, episode_ids: Sequence[int] | None = None,
+    bundle: Bundle, store: FrameStore | None, config: Config, *, episode_ids: Sequence[int] | None = None,
     seeds: Sequence[int] = (), videos_dir: Path | None = None, progress: bool = False, jobs: int = 1,
 ) -> Measurement:  # fmt: skip
     """Evaluate a model on held-out episodes and, with `seeds`, in one rollout for each task and seed.
 
     Args:
+        store: None without held-out episodes.
         episode_ids: None takes all held-out episodes.
         videos_dir: folder for videos of the rollouts; None records none.
         jobs: processes that roll out at a time.
     """
-    ids = held_out_episodes(store, config) if episode_ids is None else episode_ids
+    ids = held_out_episodes(store, config) if store and episode_ids is None else episode_ids or []
     episodes, averages = [], {}
-    if batches := held_out_batches(store, ids, config, bundle):
+    if ids and (batches := held_out_batches(store, ids, config, bundle)):
         frames = measure_frames(bundle, batches, tolerance=config.action_tolerance_deg, seed=config.seed)
         episodes, averages = by_episode(frames, store, ids), average(frames)
-    rows = roll_out(bundle, config, seeds, videos_dir, progress, jobs) if len(seeds) else []
+    rows = roll_out(bundle, config, seeds, videos_dir, progress, jobs) if len(seeds) and task_names(config) else []
     return Measurement(episodes, averages, rows)
 
 

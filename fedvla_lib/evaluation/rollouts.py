@@ -1,6 +1,6 @@
 """Closed-loop evaluation: one row per rollout, optionally with video and trajectory on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from copy import copy
 from functools import partial
@@ -16,8 +16,9 @@ from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle, uses_one_thread
 from fedvla_lib.robot.labs import REFERENCE, Lab, labs
 from fedvla_lib.robot.rollout import Episode, act_in_turn, run_episodes
-from fedvla_lib.robot.spec import CAMERAS, Actor
+from fedvla_lib.robot.spec import CAMERAS, FPS, Actor
 from fedvla_lib.robot.stage import stage_of_process
+from fedvla_lib.robot.tasks import ALL_TASKS
 from fedvla_lib.workers import side_by_side
 
 AT_ONCE = 16  # rollouts that share one batch of policy inference
@@ -127,6 +128,27 @@ def roll_out_in_places(
             if other != task:
                 add("others", other, own[: len(own) // 4], there[n : -1 : len(tasks)])
     return rows
+
+
+def simulates(config: Config) -> bool:
+    """Return whether the simulator acts as often as the policy."""
+    return config.fps == FPS
+
+
+def tasks_to_roll_out(config: Config, held: Collection[str]) -> tuple[list[str], str]:
+    """Return the tasks of a run that can be rolled out, and in one line why others cannot, or "".
+
+    Args:
+        held: what the episodes of the data show; empty if nobody says.
+    """
+    if not simulates(config):
+        return [], f"no rollouts: the policy acts fps={config.fps} times a second, the simulator {FPS}"
+    tasks = task_names(config)
+    lacking = [task for task in tasks if held and task not in held]
+    others = [task for task in ALL_TASKS if task in held and task not in tasks]
+    hint = f"; they show {', '.join(others)}: give them as tasks" if others else ""
+    why = f"no rollouts of {', '.join(lacking)}: the data show none of them{hint}" if lacking else ""
+    return [task for task in tasks if task not in lacking], why
 
 
 def roll_out(

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from fedvla_lib.config import Config
+from fedvla_lib.config import Config, split_names
 from fedvla_lib.data import frame_store, splits
 from fedvla_lib.data.batches import Batches
 from fedvla_lib.data.normalisation import Stats, episode_stats, pack_stats, unpack_stats
 from fedvla_lib.data.recordings import open_frames
 from fedvla_lib.data.splits import Share, labs_of, shares, tasks_of
 from fedvla_lib.evaluation.measure import measure
-from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds
+from fedvla_lib.evaluation.rollouts import FIRST_SEED, evaluate, rollout_seeds, simulates
 from fedvla_lib.policy import model, prefix_cache, training
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle
@@ -129,7 +129,8 @@ class Client:
 
         Seeds and the first task differ between clients, so that they do not all show the same scene.
         """
-        tasks = tasks_of(self.store, self.share.train_ids)
+        held = tasks_of(self.store, self.share.train_ids)
+        tasks = held if simulates(self.config) else []
         labs = labs_of(self.store, self.share.train_ids, self.config)
         seeds = rollout_seeds(self.config.client_rollouts, FIRST_SEED + CLIENT_SEEDS * (self.partition_id + 1))
         actor = PolicyActor(bundle, self.config.seed)
@@ -147,7 +148,8 @@ def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, o
     """Return client `partition_id` with its partition of the run's data set, or with all of its own data set.
 
     Args:
-        own_data: folder or hub id of the client's own data set; empty for its partition of ``config.data``.
+        own_data: folder or hub id of the client's own data set; empty for the one in ``config.client_data``, or its
+            partition of ``config.data``.
 
     Raises:
         ValueError: there is no such partition; the message says what to change.
@@ -157,6 +159,7 @@ def open_client(config: Config, partition_id: int, loaders: Loaders = LOADERS, o
             f"partition-id={partition_id} is not one of num-clients={config.num_clients} partitions (0 to "
             f"{config.num_clients - 1}): start as many SuperNodes as num-clients says"
         )
+    own_data = own_data or (split_names(config.client_data)[partition_id] if config.client_data else "")
     if own_data:
         return open_pooled(replace(config, data=own_data), loaders, partition_id)
     store = loaders.open_frames(config)

@@ -4,7 +4,7 @@ It leaves the path of the run folder in ``context.state["run"]["folder"]``.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, runtime_checkable
 
@@ -15,7 +15,7 @@ from fedvla_lib import files, run_folder
 from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.data import frame_store, normalisation
 from fedvla_lib.evaluation import measure
-from fedvla_lib.evaluation.rollouts import rollout_seeds
+from fedvla_lib.evaluation.rollouts import rollout_seeds, tasks_to_roll_out
 from fedvla_lib.federation import checkpoint, messages, privacy
 from fedvla_lib.federation.accountant import open_ledger
 from fedvla_lib.federation.checkpoint import Checkpoint
@@ -76,7 +76,8 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     check_tasks(task_names(config))
     states = grid if isinstance(grid, ClientStates) else None
     saved = _resume_from(config, run, states)
-    store = loaders.open_frames(config)  # before any client does: they would all record the same data
+    # Before any client does: they would all record the same data. A server whose clients have the data may have none.
+    store = loaders.open_frames(config) if config.data or not config.client_data else None
     roster = _introduce(grid, config, run, again=saved is not None)
     pooled = normalisation.pool_stats(roster.plausible_stats(run.log)) if normalisation.asks_clients(config) else {}
     stats = normalisation.common_statistics(config, pooled)
@@ -94,6 +95,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
         grid = SecureGrid(grid, config, shapes_of(arrays), strategy.records, run.log)
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
+    measured = _measured(config, store, roster, None if saved else run)
     packed = normalisation.pack_stats(stats)
     strategy.start(
         grid,
@@ -102,7 +104,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
         timeout=config.round_timeout_s,
         train_config=ConfigRecord({messages.STATS: packed}),
         evaluate_config=ConfigRecord({messages.STATS: packed}),
-        evaluate_fn=RoundEnd(config, store, bundle, run, strategy, states, saved is not None, progress, jobs),
+        evaluate_fn=RoundEnd(measured, store, bundle, run, strategy, states, saved is not None, progress, jobs),
     )
 
 
@@ -113,8 +115,8 @@ class RoundEnd:
     Personal parts of the global model are as they were before training.
     """
 
-    config: Config
-    store: frame_store.FrameStore
+    config: Config  # its tasks are those that are rolled out
+    store: frame_store.FrameStore | None
     bundle: model.Bundle
     run: RunFolder
     strategy: Checked
@@ -153,6 +155,15 @@ class RoundEnd:
         counted = {"num_examples": found.num_examples, **values, "seconds": time.perf_counter() - started}
         self.run.log(round_number, GLOBAL, "evaluate", counted)
         return values
+
+
+def _measured(config: Config, store: frame_store.FrameStore | None, roster: Roster, run: RunFolder | None) -> Config:
+    """Return the settings with the tasks that can be rolled out only; log to a new run why others cannot."""
+    shown = set(store.episodes.task if store else ()).union(*roster.tasks_of.values())
+    tasks, why = tasks_to_roll_out(config, shown)
+    if why and run:
+        run.log(0, GLOBAL, "note", {"detail": why})
+    return replace(config, tasks=",".join(tasks))
 
 
 def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) -> Checkpoint | None:
