@@ -48,10 +48,7 @@ def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None =
     Raises:
         ValueError: mods that are not given by handler.
     """
-    if mods is not None and not (isinstance(mods, Mapping) and mods.keys() <= set(HANDLERS)):
-        raise ValueError(f"mods={mods!r} is not usable: give them by handler ({', '.join(HANDLERS)}), a list for each")
-    around = {handler: list((mods or {}).get(handler, ())) for handler in HANDLERS}
-    app = ClientApp()
+    around, app = _by_handler(mods), ClientApp()
 
     @app.query(mods=around["query"])
     def query(message: Message, context: Context) -> Message:
@@ -79,6 +76,13 @@ def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None =
         return Message(_evaluated(client, bundle, message.content[messages.CONFIG][messages.ROUND]), reply_to=message)
 
     return app
+
+
+def _by_handler(mods: Mapping[str, Sequence[Mod]] | None) -> dict[str, list[Mod]]:
+    """Return the mods of every handler; ValueError unless they are given by handler."""
+    if mods is not None and not (isinstance(mods, Mapping) and mods.keys() <= set(HANDLERS)):
+        raise ValueError(f"mods={mods!r} is not usable: give them by handler ({', '.join(HANDLERS)}), a list for each")
+    return {handler: list((mods or {}).get(handler, ())) for handler in HANDLERS}
 
 
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:
