@@ -3,6 +3,7 @@
 # make data   record the demonstrations                                   make lock    pin the dependencies anew
 # make new-chapter NAME=12_force     a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
+# make test-full-size, make test-gpu   the profile gpu with random weights, on the CPU or on a card
 # make check-zip   every chapter as a reader of the zip runs it (make test does it too)
 # make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
@@ -13,7 +14,7 @@
 # share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS (chapters that
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
 .DEFAULT_GOAL := help
-.PHONY: help env address book check-site check-zip data doctor test lint lab lock new-chapter zip pdf clean
+.PHONY: help env address book check-site check-zip data doctor test test-full-size test-gpu lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -127,6 +128,13 @@ test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
 	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
+
+# The profile `gpu` with random weights: on the CPU, which takes some minutes and 8 GB, or on a card.
+test-full-size: $(STAMP)
+	$(BIN)/pytest -m full_size -s
+
+test-gpu: $(STAMP)
+	$(BIN)/pytest -m gpu -s
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \

@@ -40,7 +40,7 @@ class Config:
     frames_cap: float = 10.0  # a client counts for at most this many times the median number of frames; 0: no limit
     reply_limit_mb: float = 0.0  # largest reply of a client, in MB; 0: 100, and twice the arrays
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
-    strategy: str = "fedavg"  # fedavg, fedprox, fedavgm, fedadam, fedyogi, diloco, fedexp, fedmedian, krum or scaffold
+    strategy: str = "fedavg"  # one of `STRATEGIES`, for example fedavg, or module:Class of a Flower strategy of yours
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
     server_momentum: float = 0.5  # fedavgm, diloco: server momentum m; constant updates are scaled by 1 / (1 - m)
     clip_norm: float = 0.0  # maximum L2 norm of a client's update; 0 does not clip
@@ -72,6 +72,8 @@ class Config:
     local_optimizer: str = "adamw"  # adamw, sgd, adamw-shared or adamw-frozen, see policy/optimizers.py
     keep_optimizer: bool = False  # keep a client's optimiser state from round to round
     warmup_steps: int = 20  # gradient steps of linear learning rate warm-up
+    mixed_precision: bool = False  # training computes products in bfloat16; weights, optimiser, exchange stay float32
+    gradient_checkpointing: bool = False  # keep less for the backward pass and compute it again: slower, less memory
     checkpoint_every: int = 200  # gradient steps between checkpoints of local training; 0 keeps only the last
     # evaluation
     validate_every: int = 1  # rounds between saved global models, each evaluated on the held-out episodes
@@ -99,6 +101,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "base": "lerobot/smolvla_base", "train_state_proj": True, "augment": True, "image_size": 224, "chunk_size": 50,
         "n_action_steps": 50, "episodes_per_task": 100, "fraction_train": 1.0, "local_steps": 200, "batch_size": 64,
         "lr": 1e-4, "warmup_steps": 200, "eval_every": 5, "eval_rollouts": 20, "device": "cuda",
+        "mixed_precision": True,
     },
 }  # fmt: skip
 PARTITIONS = ("modulo", "task", "dirichlet", "lab")
@@ -108,6 +111,7 @@ EXCHANGES = ("float32", "float16", "int8")
 STRATEGIES = (
     "fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "diloco", "fedexp", "fedmedian", "krum", "scaffold",
 )  # fmt: skip
+BROUGHT = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a strategy that is not of this library
 SAMPLINGS = ("uniform", "by-task")
 LOCAL_OPTIMIZERS = ("adamw", "sgd", "adamw-shared", "adamw-frozen")
 
@@ -185,11 +189,13 @@ def check(config: Config) -> Config:
         _require(0 <= getattr(config, name) <= 1, config, name, "a number from 0 to 1")
     _require(config.fraction_train > 0, config, "fraction_train", "a number above 0")
     choices = {
-        "partition": PARTITIONS, "normalisation": NORMALISATIONS, "strategy": STRATEGIES, "exchange": EXCHANGES,
-        "sampling": SAMPLINGS, "local_optimizer": LOCAL_OPTIMIZERS, "noise_by": NOISE_BY,
+        "partition": PARTITIONS, "normalisation": NORMALISATIONS, "exchange": EXCHANGES, "sampling": SAMPLINGS,
+        "local_optimizer": LOCAL_OPTIMIZERS, "noise_by": NOISE_BY,
     }  # fmt: skip
     for name, valid in choices.items():
         _require(getattr(config, name) in valid, config, name, f"one of {', '.join(valid)}")
+    known = config.strategy in STRATEGIES or BROUGHT.fullmatch(config.strategy)
+    _require(bool(known), config, "strategy", f"one of {', '.join(STRATEGIES)}, or module:Class of a Flower strategy")
     limit = f"at most chunk_size={config.chunk_size}"
     _require(config.n_action_steps <= config.chunk_size, config, "n_action_steps", limit)
     whole = not config.one_task_per_lab or config.num_labs % max(1, len(task_names(config))) == 0

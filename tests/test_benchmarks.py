@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from fedvla_lib.config import from_profile
 from fedvla_lib.policy import model
@@ -66,6 +67,18 @@ def test_bad_input_is_one_line_that_names_it(tmp_path, warm_python):
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode and "juggle" in done.stderr and "lift" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and not list(tmp_path.iterdir())
+
+
+def test_operations_are_those_that_are_stored(run):
+    """They do not depend on the machine; the page on costs reads the stored ones."""
+    assert run("operations") == json.loads((FOLDER / "results" / "operations.json").read_text())["rows"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card to measure")
+def test_without_a_card_nothing_is_measured_and_nothing_fails(tmp_path, warm_python):
+    command = [warm_python, FOLDER / "gpu.py", "--out", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.startswith("no card") and not list(tmp_path.iterdir())
 
 
 def test_a_federation_is_measured_against_its_clients(run):

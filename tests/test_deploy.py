@@ -120,7 +120,7 @@ def test_a_deployment_gives_the_model_of_the_inline_engine_and_each_node_learns_
     assert any("round 2, client_1, train: loss" in line for line in said)
     inline, forgetful = (
         run_inline(tiny, clients_app=app, data=own, progress=False, raise_errors=True)
-        for app in (None, client_app.build(mods=[forget]))
+        for app in (None, client_app.build(mods=dict.fromkeys(client_app.HANDLERS, [forget])))
     )
     deployed, kept, forgotten = (
         load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline, forgetful)

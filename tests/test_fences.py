@@ -39,8 +39,8 @@ FENCES = {
     "mink": {"robot.expert"},
     "gymnasium": {"robot.lerobot_env", "robot.sim"},
     "torch": {
-        "policy.actor", "policy.lean_expert", "policy.lora", "policy.model", "policy.optimizers", "policy.parameters",
-        "policy.prefix_cache", "policy.training",
+        "policy.actor", "policy.gradient_checkpoints", "policy.lean_expert", "policy.lora", "policy.model",
+        "policy.optimizers", "policy.parameters", "policy.prefix_cache", "policy.training",
         "data.augmentation", "data.batches", "data.frame_store", "evaluation.held_out", "pretraining.grounding",
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },

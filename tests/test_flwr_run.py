@@ -68,7 +68,7 @@ def test_the_simulation_runtime_gives_the_model_of_the_inline_engine(tiny):
     assert PYPROJECT.read_bytes() == before
     inline, forgetful = (
         run_inline(replace(tiny, client_rollouts=0), clients_app=app, progress=False, raise_errors=True)
-        for app in (None, client_app.build(mods=[forget]))
+        for app in (None, client_app.build(mods=dict.fromkeys(client_app.HANDLERS, [forget])))
     )
     left, right, other = (
         load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline, forgetful)

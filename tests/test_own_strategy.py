@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,6 @@ import pytest
 from fedvla_lib import run_folder
 from fedvla_lib.config import from_profile
 from fedvla_lib.engines import inline
-from fedvla_lib.federation import client_app
-from fedvla_lib.federation.nodes import TooFewReplies
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "book" / "own_strategy.md").read_text()
@@ -78,17 +77,17 @@ def test_the_run_and_the_experiment_of_the_page_give_a_row_each(library, tmp_pat
 
 
 @pytest.mark.integration
-def test_a_mod_that_changes_arrays_needs_a_seal(tmp_path):
+def test_the_classes_and_mods_of_the_page_work_without_editing_the_library(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(blocks("python")[2])
     space = {}
-    for block in blocks("python")[1:]:
-        exec(compile(block.split("start = np.array")[0], "own_strategy.md", "exec"), space)
+    for block in (blocks("python")[1].split("start = np.array")[0], blocks("python")[3]):
+        exec(compile(block, "own_strategy.md", "exec"), space)
     config = from_profile(
-        "tiny", base="nano", out=str(tmp_path), num_server_rounds=1, local_steps=1, eval_rollouts=0, client_rollouts=0
-    )
-    for app in (space["watched"], space["rounding"]):
-        run = inline.run_inline(config, clients_app=app, progress=False)
+        "tiny", base="nano", data=str(recording), out=str(tmp_path / "runs"), num_server_rounds=1, local_steps=1,
+        eval_rollouts=0, client_rollouts=0,
+    )  # fmt: skip
+    for strategy, app in (("mine:Trimmed", "watched"), ("mine:Private", "rounding")):
+        run = inline.run_inline(replace(config, strategy=strategy), clients_app=space[app], progress=False)
         assert run_folder.read_metrics(run, "rejected").empty
-    with pytest.raises(TooFewReplies):
-        inline.run_inline(config, clients_app=client_app.build(mods=[space["coarse"]]), progress=False)
-    refused = run_folder.read_metrics(sorted(tmp_path.iterdir())[-1], "rejected")
-    assert set(refused.reason) == {"hash"}
+        assert len(run_folder.read_metrics(run, "evaluate").query("round == 1")) == 4  # clients, and the server

@@ -18,7 +18,6 @@ from fedvla_lib.engines import inline
 from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid, claim_identity
 from fedvla_lib.federation import accountant, client_app, messages, privacy, secure_aggregation
 from fedvla_lib.federation.accountant import BudgetSpent, Ledger
-from fedvla_lib.federation.client import open_client
 from fedvla_lib.federation.nodes import Roster, TooFewReplies
 from fedvla_lib.federation.strategies import build
 from fedvla_lib.policy.parameters import digest, shapes_of
@@ -282,10 +281,10 @@ def test_a_client_that_trusts_nobody_sends_no_loss_no_statistics_and_keeps_count
     over = replace(tiny, epsilon_budget=accountant.epsilon(tiny, 1, SIZE) * 1.01, secret_noise=True)
     with pytest.raises(ValueError, match="num-server-rounds=1"):
         inline.run_inline(over, progress=False)
-    one, context = open_client(replace(over, noise_by="client"), 0), Context(1, 1, {}, RecordDict(), {})
-    client_app._spend(one, context, SIZE)
+    trusting_nobody, context = replace(over, noise_by="client"), Context(1, 1, {}, RecordDict(), {})
+    client_app._spend(trusting_nobody, context, SIZE)
     with pytest.raises(ValueError, match="budget is spent"):
-        client_app._spend(one, context, SIZE)
+        client_app._spend(trusting_nobody, context, SIZE)
 
 
 @pytest.mark.integration

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import yaml
 
+import cost_page
 import joining
 import library
 import status
@@ -18,7 +19,7 @@ STATUS_PAGE = "book/run_times.md"
 STATUS = b"<!-- status -->"  # replaced by the status of the build
 MODEL_CARD = "book/nano_base.md"  # ends with generated results of the nano base
 FRONT_PAGE = "book/index.md"
-JOINING = "book/joining.md"  # has marks of `joining.parts`
+MARKED = {"book/joining.md": joining.parts, "book/costs.md": cost_page.parts}  # have the marks of these
 HEADLINE = b"<!-- headline -->"  # on the front page: replaced by the result of the comparison
 ARCHITECTURE, MODULES, IMPORTS = "book/architecture.md", b"<!-- modules -->", "book/_static/imports.svg"
 FUNCTIONS_PAGE, FUNCTIONS = "book/library.md", b"<!-- functions -->"
@@ -33,6 +34,7 @@ RESULTS_ON = {
         "start_up",
     ],
     "book/scale.md": ["scale"],
+    "book/costs.md": ["operations"],
 }  # fmt: skip
 TITLES = {
     "fine_tuning": "fine-tuning: each task alone from the base, on one core",
@@ -57,8 +59,9 @@ def lay_out(root: Path, source: Path, chapters: list[Chapter], profile: str) -> 
         rows = compared(root / COMPARISON)
         _put(wanted, FRONT_PAGE, HEADLINE, lambda: headline(rows))
         wanted[Path(OUTCOME)] = outcome(rows)
-    for mark, text in joining.parts(root).items() if Path(JOINING) in wanted else ():
-        _put(wanted, JOINING, mark, text)
+    for page, parts in MARKED.items():
+        for mark, text in parts(root).items() if Path(page) in wanted else ():
+            _put(wanted, page, mark, text)
     if Path(MODEL_CARD) in wanted:
         wanted[Path(MODEL_CARD)] += _card_tables(json.loads((root / ACCOUNT).read_text(encoding="utf-8"))).encode()
     wanted |= _library_pages(root, wanted, executed.values())

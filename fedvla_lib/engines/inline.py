@@ -27,6 +27,7 @@ from fedvla_lib.config import Config, check, to_run_config
 from fedvla_lib.federation import client, client_app, server_app
 from fedvla_lib.federation.client import cached
 from fedvla_lib.federation.messages import DATA, PARTITION, pack_arrays, unpack_arrays
+from fedvla_lib.federation.strategies.build import brought
 from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.workers import processes
 
@@ -55,6 +56,8 @@ def run_inline(
     """
     if jobs > 1 and (clients_app or raise_errors):
         raise ValueError(f"jobs={jobs}: clients_app and raise_errors need jobs=1, which runs clients in this process")
+    if ":" in config.strategy:
+        brought(config.strategy)  # or end before there is a run folder
     loaders = cached(client.LOADERS)
     app = clients_app or client_app.build(loaders)
     run_config = to_run_config(check(config))

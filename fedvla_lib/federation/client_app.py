@@ -6,22 +6,22 @@ Exceptions are not caught here: Flower turns them into error replies, which the 
 import logging
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from flwr.app import Context, Message, MetricRecord, RecordDict
+from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
-from flwr.clientapp.typing import Mod
+from flwr.clientapp.typing import ClientAppCallable, Mod
 
 from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import measure
 from fedvla_lib.federation import accountant, messages, privacy, rollout_replies, secure_round
 from fedvla_lib.federation.client import LOADERS, WORKER_LOADERS, Client, Loaders, open_client
-from fedvla_lib.federation.quantisation import DOWNWARD, with_feedback
+from fedvla_lib.federation.quantisation import DOWNWARD, decode, with_feedback
 from fedvla_lib.federation.strategies.fedprox import Proximal
 from fedvla_lib.federation.strategies.scaffold import ControlVariates
 from fedvla_lib.policy.model import Bundle
@@ -35,17 +35,22 @@ PERSONAL = "own"  # personal parts of the model
 LEFT_OVER = "left-over"  # rounding error of its updates so far
 PRIVACY = "privacy"  # its releases so far
 ALL_RECORDS = (messages.ARRAYS, *messages.EXTRA)  # of arrays, in a message for training
+HANDLERS = ("query", "train", "evaluate")  # that mods may be given for; those of secure aggregation are none of them
 
 
-def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
+def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None = None) -> ClientApp:
     """Return the ClientApp, with handlers for query (statistics), train and evaluate.
 
     Args:
-        mods: Flower's mods around the handlers, outermost first.
-    """
-    app = ClientApp(mods=list(mods))
+        mods: Flower's mods by handler, outermost first. Around `train` they get the trained weights; what leaves the
+            client is clipped, noised, masked, encoded and signed after them.
 
-    @app.query()
+    Raises:
+        ValueError: mods that are not given by handler.
+    """
+    around, app = _by_handler(mods), ClientApp()
+
+    @app.query(mods=around["query"])
     def query(message: Message, context: Context) -> Message:
         with _reasons_kept(context):
             client = _client(context, loaders)
@@ -55,17 +60,16 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
         note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()) if asked else "")
         return Message(RecordDict({messages.NOTE: note}), reply_to=message)
 
-    @app.train()
+    @app.train(mods=[_released, *around["train"]])
     def train(message: Message, context: Context) -> Message:
-        with _reasons_kept(context):
-            client = _client(context, loaders)
-            bundle = _policy(client, message, loaders, context)
-            return Message(_trained(client, bundle, message, context), reply_to=message)
+        client = _client(context, loaders)
+        bundle = _policy(client, message, loaders, context)
+        return Message(_trained(client, bundle, message, context), reply_to=message)
 
     for name, handler in secure_round.HANDLERS.items():
         app.train(name)(handler)
 
-    @app.evaluate()
+    @app.evaluate(mods=around["evaluate"])
     def evaluate(message: Message, context: Context) -> Message:
         client = _client(context, loaders)
         bundle = _policy(client, message, loaders, context)
@@ -74,31 +78,30 @@ def build(loaders: Loaders = LOADERS, mods: Sequence[Mod] = ()) -> ClientApp:
     return app
 
 
+def _by_handler(mods: Mapping[str, Sequence[Mod]] | None) -> dict[str, list[Mod]]:
+    """Return the mods of every handler; ValueError unless they are given by handler."""
+    if mods is not None and not (isinstance(mods, Mapping) and mods.keys() <= set(HANDLERS)):
+        raise ValueError(f"mods={mods!r} is not usable: give them by handler ({', '.join(HANDLERS)}), a list for each")
+    return {handler: list((mods or {}).get(handler, ())) for handler in HANDLERS}
+
+
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:
-    """Train for one round, save the client's state, and return the content of the reply."""
-    exchange, keeps_moments = client.config.exchange, client.config.keep_optimizer
-    hides = privacy.hides_updates(client.config)
-    start = bundle.shared_arrays() if hides or exchange != "float32" else {}  # only needed to send an update
+    """Train for one round, save the client's state, and return the content of a reply, which `_released` completes."""
+    keeps_moments = client.config.keep_optimizer
     correction = correction_for(message, context, bundle.shared())
     moments = _load_state(context, MOMENTS) if keeps_moments else None
     round_number, second = message.content[messages.CONFIG][messages.ROUND], _sent_second_moments(message, bundle)
     result = client.train(bundle, round_number, correction, moments, second)
-    arrays, extra = bundle.shared_arrays(), control_variates(correction, context)
+    payload = {messages.ARRAYS: bundle.shared_arrays(), **control_variates(correction, context)}
     if result.second_moments:
-        extra[messages.SECOND_MOMENTS] = result.second_moments
-    if hides:
-        arrays, extra = _hidden(arrays, start, extra, client, message, context)
+        payload[messages.SECOND_MOMENTS] = result.second_moments
     metrics = {
         messages.EXAMPLES: _weight(client), messages.STEPS: result.steps, "seconds": result.seconds,
         "loss": sum(result.losses) / len(result.losses),
     }  # fmt: skip
-    arrays = _outgoing(arrays, start, exchange, context)
-    content = RecordDict({
-        messages.ARRAYS: messages.pack_arrays(arrays), messages.NOTE: messages.make_note(sha256=digest(arrays)),
-        messages.METRICS: MetricRecord({name: metrics[name] for name in messages.train_metrics(hides)}),
-    })  # fmt: skip
-    for record, values in extra.items():
-        messages.attach(content, messages.NOTE, record, values)
+    content = RecordDict({record: messages.pack_arrays(arrays) for record, arrays in payload.items()})
+    told = messages.train_metrics(privacy.hides_updates(client.config))
+    content[messages.METRICS] = MetricRecord({name: metrics[name] for name in told})
     if keeps_moments:
         context.state[MOMENTS] = messages.pack_arrays(result.moments)
     if bundle.own:
@@ -132,6 +135,30 @@ def on_reserved_gpu(config: Config, gpus: Sequence[str]) -> Config:
     GPUs are reserved by Flower's connection, which the settings of a run do not know.
     """
     return replace(config, device="cuda") if gpus and config.device == Config.device else config
+
+
+def _released(message: Message, context: Context, call_next: ClientAppCallable) -> Message:
+    """The mod around all others: hide and encode the update as the settings ask, and announce the SHA-256."""
+    with _reasons_kept(context):
+        reply = call_next(message, context)
+        if not reply.has_error():
+            _release(reply.content, message, context, from_run_config(context.run_config))
+    return reply
+
+
+def _release(content: RecordDict, message: Message, context: Context, config: Config) -> None:
+    """Replace the arrays of a reply by what leaves the client, and add the note of their digests."""
+    payload = {record: messages.unpack_arrays(arrays) for record, arrays in content.array_records.items()}
+    hides, exchange = privacy.hides_updates(config), config.exchange
+    if hides or exchange != "float32":
+        start = decode(messages.unpack_arrays(message.content[messages.ARRAYS]), DOWNWARD[exchange])
+        hidden = _hidden(payload, start, message, context, config) if hides else payload
+        payload = {**hidden, messages.ARRAYS: _outgoing(hidden[messages.ARRAYS], start, exchange, context)}
+        for record in list(content.array_records):
+            del content[record]
+        content.update({record: messages.pack_arrays(arrays) for record, arrays in payload.items()})
+    digests = {messages.digest_key(record): digest(arrays) for record, arrays in payload.items()}
+    content[messages.NOTE] = ConfigRecord(digests)
 
 
 def _client(context: Context, loaders: Loaders) -> Client:
@@ -180,22 +207,23 @@ def _outgoing(arrays: Arrays, start: Arrays, exchange: str, context: Context) ->
 
 
 def _hidden(
-    arrays: Arrays, start: Arrays, extra: privacy.Payload, client: Client, message: Message, context: Context
-) -> tuple[Arrays, privacy.Payload]:
+    payload: privacy.Payload, start: Arrays, message: Message, context: Context, config: Config
+) -> privacy.Payload:
     """Return weights and extra records as the server may see them: clipped, and noised or masked."""
-    config, round_number = client.config, message.content[messages.CONFIG][messages.ROUND]
-    payload = {messages.ARRAYS: {name: array - start[name] for name, array in arrays.items()}, **extra}
-    _spend(client, context, sum(array.size for arrays in payload.values() for array in arrays.values()))
-    payload = privacy.from_client(payload, config, round_number, client.partition_id)
+    changes = {name: array - start[name] for name, array in payload[messages.ARRAYS].items()}
+    payload = {**payload, messages.ARRAYS: changes}
+    _spend(config, context, sum(array.size for arrays in payload.values() for array in arrays.values()))
+    round_number, who = message.content[messages.CONFIG][messages.ROUND], int(context.node_config[messages.PARTITION])
+    payload = privacy.from_client(payload, config, round_number, who)
     if config.secure_aggregation:
-        return secure_round.masked_update(payload, message, context, config), {}
-    changes = payload.pop(messages.ARRAYS)
-    return {name: start[name] + change for name, change in changes.items()}, payload
+        return {messages.ARRAYS: secure_round.masked_update(payload, message, context, config)}
+    ends = {name: start[name] + change for name, change in payload[messages.ARRAYS].items()}
+    return {**payload, messages.ARRAYS: ends}
 
 
-def _spend(client: Client, context: Context, size: int) -> None:
+def _spend(config: Config, context: Context, size: int) -> None:
     """Count a release of this client's, which does not trust the server's count; raise ValueError over budget."""
-    config, releases = client.config, 1 + int(_load_state(context, PRIVACY).get("releases", 0))
+    releases = 1 + int(_load_state(context, PRIVACY).get("releases", 0))
     if privacy.is_private(config) and config.epsilon_budget and config.noise_by != "server":
         if (spent := accountant.epsilon(config, releases, size)) > config.epsilon_budget:
             raise ValueError(f"this client's release {releases} would make epsilon {spent:.3g}: its budget is spent")
@@ -236,13 +264,26 @@ def _load_state(context: Context, what: str) -> Arrays:
 def _policy(client: Client, message: Message, loaders: Loaders, context: Context) -> Bundle:
     """Return the policy with the checked global arrays of the message and the client's personal parts."""
     content, config = message.content, client.config
-    sent = content[messages.CONFIG][messages.STATS]
-    stats = client.statistics() if config.normalisation == "own" else normalisation.unpack_stats(sent)
-    bundle = loaders.load_policy(config, stats)
+    bundle = loaders.load_policy(config, _statistics(client, content[messages.CONFIG]))
     shapes, exchange = shapes_of(bundle.shared()), DOWNWARD[config.exchange]
     arrays = messages.checked_arrays(content, messages.CONFIG, shapes, also=ALL_RECORDS, exchange=exchange)
     load_arrays(bundle.policy, arrays | (_load_state(context, PERSONAL) or bundle.own))
     return bundle
+
+
+def _statistics(client: Client, said: ConfigRecord) -> normalisation.Stats:
+    """Return what to normalise with; ValueError if the server should have sent it, and is one that sends none."""
+    config = client.config
+    if config.normalisation == "own":
+        return client.statistics()
+    if messages.STATS in said:
+        return normalisation.unpack_stats(said[messages.STATS])
+    if normalisation.asks_clients(config):
+        raise ValueError(
+            f"normalisation={config.normalisation!r} needs the statistics that a server of this library pools and "
+            "sends: give normalisation=base, own or none with another server"
+        )
+    return normalisation.common_statistics(config, {})
 
 
 app = build(WORKER_LOADERS)

@@ -83,25 +83,30 @@ def checked_arrays(
     """Unpack `record` and check names, shapes, finiteness and the SHA-256 in record `digest_in`.
 
     Args:
+        digest_in: `NOTE` of a client, who has to announce a SHA-256, or `CONFIG` of a server, who may announce none at
+            all: Flower's stock strategies do not.
         also: other records of arrays that are allowed.
         exchange: how the arrays were encoded; they are returned as float32.
 
     Raises:
         ParameterError: what is wrong, in one line.
     """
-    key = digest_key(record)
-    announced = content.config_records.get(digest_in, {}).get(key)
+    key, said = digest_key(record), content.config_records.get(digest_in, {})
+    announced, unchecked = said.get(key), digest_in == CONFIG and DIGEST not in said
     names = list(content.array_records)
     if record not in names or set(names) - {record, *also}:
         raise ParameterError("names", f"expected one record {record!r} of arrays, got {names}")
-    if not isinstance(announced, str):
+    if not (isinstance(announced, str) or unchecked and announced is None):
         raise ParameterError("hash", f"there is no SHA-256 under {digest_in}.{key}")
     arrays = unpack_arrays(content.array_records[record])
     if exchange == "float32":
+        if unchecked:  # Flower's adaptive strategies compute in float64
+            arrays = {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
         check_arrays(arrays, shapes, announced)
         return arrays
     check_encoded(arrays, shapes, exchange)
-    check_digest(arrays, announced)
+    if announced is not None:
+        check_digest(arrays, announced)
     arrays = decode(arrays, exchange)
     check_arrays(arrays, shapes)  # finite steps of a finite scale can be infinite
     return arrays

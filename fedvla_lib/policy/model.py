@@ -27,6 +27,7 @@ from fedvla_lib.config import Config, granted_cores, split_names
 from fedvla_lib.data.normalisation import Stats
 from fedvla_lib.files import new_folder
 from fedvla_lib.policy import lean_expert
+from fedvla_lib.policy.gradient_checkpoints import recompute_activations
 from fedvla_lib.policy.lora import add_adapters, merged
 from fedvla_lib.policy.nano import NANO, NANO_RANDOM, VLM_FOLDER, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
@@ -88,6 +89,8 @@ def load_policy(config: Config, stats: Stats | None = None) -> Bundle:
     if config.lora_rank:
         chosen = {"freeze_a": config.lora_freeze_a, "adapt_state": config.train_state_proj, "seed": config.seed}
         add_adapters(policy, config.lora_rank, **chosen)
+    if config.gradient_checkpointing:
+        recompute_activations(policy)
     policy.eval()
     return Bundle(policy, *_processors(policy, stats, source), _own(policy, split_names(config.personal)))
 
@@ -181,7 +184,7 @@ def _pretrained(config: Config, base: str) -> SmolVLAPolicy:
             "LeRobot's pretrained_model format, or a hub id while the hub is reachable (unset HF_HUB_OFFLINE)"
         ) from error
     _require_all_weights(policy, base)
-    return policy
+    return policy.float()  # the expert of smolvla_base is made in bfloat16, which rounds small updates away
 
 
 def _require_all_weights(policy: SmolVLAPolicy, base: str) -> None:

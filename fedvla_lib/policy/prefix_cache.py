@@ -94,7 +94,7 @@ def _velocity(
     bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noisy: torch.Tensor, times: torch.Tensor, width: int
 ) -> torch.Tensor:
     stored, real = (part.to(noisy.device) for part in prefix)
-    if bundle.is_lean:
+    if bundle.is_lean and not torch.is_autocast_enabled(noisy.device.type):  # its derivatives are float32
         return lean_expert.velocity(bundle.policy, stored, real, noisy, times, width)
     cache = DynamicCache([each.unbind(1) for each in stored.unbind(1)])
     return bundle.policy.model.denoise_step(real, cache, noisy, times)[..., :width]

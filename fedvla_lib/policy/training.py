@@ -88,7 +88,7 @@ def local_train(
     """
     use_threads(config, bundle.policy)
     began, loss = time.perf_counter(), objective.loss or flow_loss
-    with _seeded(batches.seed, start.step):
+    with seeded(batches.seed, start.step):
         length = start.total_steps or start.step + steps
         optimizer, scheduler = optimizers.build(bundle, config, start.step, length, start.second_moments)
         _load_moments(bundle, optimizer, start.moments or {})
@@ -98,7 +98,8 @@ def local_train(
         done = len(losses)
         bar = tqdm(range(done, steps), initial=done, total=steps, desc="training", disable=not progress)
         for step in bar:
-            value = loss(bundle, batches.at(start.step + step))
+            with torch.autocast(torch.device(config.device).type, torch.bfloat16, enabled=config.mixed_precision):
+                value = loss(bundle, batches.at(start.step + step))
             losses.append(_step(bundle, parameters, value, optimizer, scheduler, objective.correction))
             if not np.isfinite(losses[-1]):
                 raise FloatingPointError(f"loss is {losses[-1]} at step {start.step + step}: lower lr={config.lr}")
@@ -156,8 +157,8 @@ def _load_moments(bundle: Bundle, optimizer: torch.optim.Optimizer, moments: Arr
 
 
 @contextmanager
-def _seeded(seed: int, start_step: int) -> Iterator[None]:
-    """Seed noise and flow time by (seed, start_step) and restore the caller's random state."""
+def seeded(seed: int, start_step: int) -> Iterator[None]:
+    """Seed all global random generators by (seed, start_step), and restore the caller's random state at the end."""
     before = get_rng_state()
     set_seed(int(np.random.SeedSequence([seed, start_step]).generate_state(1)[0]))
     try:

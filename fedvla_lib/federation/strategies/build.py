@@ -1,8 +1,13 @@
-"""Choose the strategy by the settings: one of Flower's with the checks of `Checked`, or one that Flower lacks."""
+"""Choose the strategy by the settings: with the checks of `Checked` one of Flower's, one that it lacks, or yours."""
 
+import importlib
+import os
+import sys
 from typing import Any
 
-from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi, Krum
+from flwr.serverapp import strategy as flower
+from flwr.serverapp.strategy import FedAdam, FedAvg, FedAvgM, FedMedian, FedProx, FedYogi, Krum, Strategy
+from flwr.supercore.differential_privacy import KEY_NORM_BIT
 
 from fedvla_lib.config import Config
 from fedvla_lib.federation.strategies.checked import Checked
@@ -21,6 +26,8 @@ def build_strategy(config: Config, **checked: Any) -> Checked:
     Args:
         **checked: the other arguments of `Checked`.
     """
+    if ":" in config.strategy:
+        return _checked(brought(config.strategy))(config=config, **checked)
     rate = config.server_lr or SERVER_LR.get(config.strategy, 1.0)
     strategy, options = {
         # sum_k n_k w_k / sum_k n_k with n_k the training frames of client k
@@ -45,6 +52,42 @@ def build_strategy(config: Config, **checked: Any) -> Checked:
         "krum": (Krum, {"num_malicious_nodes": config.num_malicious}),
         "scaffold": (CheckedScaffold, {}),
     }[config.strategy]
-    if not issubclass(strategy, Checked):
-        strategy = type(f"Checked{strategy.__name__}", (Checked, strategy), {})
-    return strategy(config=config, **options, **checked)
+    return _checked(strategy)(config=config, **options, **checked)
+
+
+def brought(strategy: str) -> type[Strategy]:
+    """Return the class that a setting ``module:Class`` names, which has to need no arguments.
+
+    Modules are found where Python finds them, and in the working directory.
+
+    Raises:
+        ValueError: there is no such Flower strategy, or it cannot work with our clients.
+    """
+    module, _, name = strategy.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except Exception as error:  # whatever the module does while it is imported
+        raise ValueError(
+            f"strategy={strategy!r} cannot be imported ({type(error).__name__}: {error}): the module has to be in the "
+            "working directory, in the app's bundle (fab-include) or installed where the server runs"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Strategy)):
+        raise ValueError(f"strategy={strategy!r}: {module} has no class {name!r} derived from Flower's Strategy")
+    if issubclass(found, flower.FedXgbBagging | flower.FedXgbCyclic):
+        raise ValueError(f"strategy={strategy!r} combines decision trees: give one that combines arrays")
+    try:
+        found()
+    except TypeError as error:
+        raise ValueError(f"strategy={strategy!r} needs arguments: derive a class that gives them ({error})") from error
+    return found
+
+
+def _checked(strategy: type[Strategy]) -> type[Checked]:
+    """Return the strategy with our checks before it."""
+    if issubclass(strategy, Checked):
+        return strategy
+    counts = issubclass(strategy, flower.DifferentialPrivacyClientSideAdaptiveClipping)
+    extra = {"extra_metrics": (KEY_NORM_BIT,)} if counts else {}
+    return type(f"Checked{strategy.__name__}", (Checked, strategy), extra)

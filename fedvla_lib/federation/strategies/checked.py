@@ -8,14 +8,17 @@ and the client drift.
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord
+from flwr.app.exception import AppExitException
 from flwr.serverapp import Grid
+from flwr.serverapp.strategy import Strategy
 
 from fedvla_lib.config import Config
 from fedvla_lib.evaluation import measure
@@ -27,15 +30,17 @@ from fedvla_lib.federation.quantisation import DOWNWARD, encode
 from fedvla_lib.federation.rollout_replies import Rollouts, unpack_rollouts
 from fedvla_lib.policy.optimizers import SHARING
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
+from fedvla_lib.policy.training import seeded
 from fedvla_lib.run_folder import GLOBAL
 
 logger = logging.getLogger(__name__)
 ROOM_BYTES, BYTES_A_NUMBER = 100e6, 8  # of a reply: for films and the like, and for the arrays
+EVERYBODY = ("fraction_train", "fraction_evaluate", "min_train_nodes", "min_evaluate_nodes", "min_available_nodes")
 PERSISTENT = ("momentum_vector", "m_t", "v_t", "limits", *messages.EXTRA)  # attributes that persist between rounds
 
 
 class Checked:
-    """Mixin: ``class CheckedX(Checked, X)`` for a Flower strategy X derived from FedAvg.
+    """Mixin: ``class CheckedX(Checked, X)`` for a Flower strategy X, or wrapper of one; it gets what passed the checks.
 
     Args:
         config: settings of the run: sampling, encoding of arrays, clipping, replies that a round needs.
@@ -54,7 +59,11 @@ class Checked:
         self, *, config: Config, roster: Roster, shapes: Shapes, report: Report,
         keep_rollouts: Callable[[int, str, Rollouts], None], rounds_done: int = 0, **flower: Any,
     ) -> None:  # fmt: skip
-        super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **flower)
+        super().__init__(**flower)
+        layer: Any = self
+        while isinstance(layer, Strategy):  # it finds only those that were sampled here
+            vars(layer).update(dict.fromkeys(EVERYBODY, 1))
+            layer = getattr(layer, "strategy", None)
         self.config, self.roster, self.shapes = config, roster, shapes
         self.report, self.keep_rollouts, self.rounds_done = report, keep_rollouts, rounds_done
         if config.local_optimizer in SHARING:
@@ -76,7 +85,10 @@ class Checked:
         self._global = messages.unpack_arrays(arrays)
         sampled = self._sample(self.config.fraction_train, server_round, 0)
         self._spent = self.ledger.spend() if self.ledger and privacy.hides_updates(self.config) else {}
-        return super().configure_train(server_round + self.rounds_done, arrays, config, sampled)
+        server_round += self.rounds_done
+        with self._in_flower(server_round):
+            sent = super().configure_train(server_round, arrays, config, sampled)
+        return self._sealed(sent, self._extra_records)
 
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
@@ -85,7 +97,7 @@ class Checked:
         sampled = self._sample(self.config.fraction_evaluate, server_round, 1)
         if not self._sampled:
             return []
-        return super().configure_evaluate(server_round + self.rounds_done, arrays, config, sampled)
+        return self._sealed(super().configure_evaluate(server_round + self.rounds_done, arrays, config, sampled))
 
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
@@ -93,7 +105,7 @@ class Checked:
         """Aggregate the valid replies.
 
         Raises:
-            TooFewReplies: there are fewer than `min_replies`.
+            TooFewReplies: there are fewer than `min_replies`, or too few for the strategy.
             FloatingPointError: the new global arrays, or what the strategy keeps, are not finite.
         """
         server_round += self.rounds_done
@@ -103,7 +115,7 @@ class Checked:
                 f"round {server_round}: {len(valid)} of {len(self._sampled)} training replies are valid, "
                 f"min-replies={self.config.min_replies} are required; the rejected ones are in metrics.jsonl"
             )
-        for reply in valid if self.config.exchange != "float32" else []:
+        for reply in valid:
             self._restore(reply)
         self._report_drift(server_round, valid)
         if self.config.clip_norm or self.ledger:
@@ -113,7 +125,10 @@ class Checked:
             if reply.metadata.src_node_id in self.roster.examples_of:
                 values = reply.content.metric_records[messages.METRICS]
                 values[messages.EXAMPLES] = self.roster.weight(reply.metadata.src_node_id)
-        arrays, metrics = super().aggregate_train(server_round, valid)
+        with self._in_flower(server_round):
+            arrays, metrics = super().aggregate_train(server_round, valid)
+        if arrays is None:
+            raise TooFewReplies(f"round {server_round}: strategy={self.config.strategy} refused {len(valid)} replies")
         # Flower's adaptive strategies compute in float64.
         model = {name: np.asarray(array.numpy(), np.float32) for name, array in arrays.items()}
         _require_finite(server_round, {messages.ARRAYS: model, **self.state()})
@@ -150,29 +165,45 @@ class Checked:
         return {name: listed.get(name) or dict(value) for name, value in kept.items()}
 
     def load_state(self, state: dict[str, Arrays]) -> None:
-        """Restore what `state` returned in another process."""
+        """Restore what `state` returned in another process; ValueError if that cannot be all."""
+        if isinstance(getattr(self, "strategy", None), Strategy):
+            raise ValueError(f"strategy={self.config.strategy!r} wraps another, whose state is not saved: start anew")
         for attribute, arrays in state.items():
             listed = all(name.isdecimal() for name in arrays)
             setattr(self, attribute, [arrays[str(i)] for i in range(len(arrays))] if listed else arrays)
 
-    def _construct_messages(self, record: RecordDict, node_ids: list[int], message_type: str) -> list[Message]:
-        """Flower's, with encoded arrays and their SHA-256; strategies have stored the unrounded ones by now."""
-        for name in self._extra_records if message_type == MessageType.TRAIN else ():
-            if extra := getattr(self, name):  # second moments are known after the first round
-                messages.attach(record, messages.CONFIG, name, extra)
-        arrays = encode(messages.unpack_arrays(record[messages.ARRAYS]), DOWNWARD[self.config.exchange])
-        record[messages.CONFIG][messages.DIGEST] = digest(arrays)
-        if self.config.exchange != "float32":
-            record[messages.ARRAYS] = messages.pack_arrays(arrays)
-        sent = list(super()._construct_messages(record, node_ids, message_type))
+    def _sealed(self, sent: Iterable[Message], extra: tuple[str, ...] = ()) -> list[Message]:
+        """The strategy's messages, with encoded arrays and their SHA-256; it has stored the unrounded ones by now."""
+        sent = list(sent)
+        for content in {id(message.content): message.content for message in sent}.values():  # they may share one
+            for name in extra:
+                if arrays := getattr(self, name):  # second moments are known after the first round
+                    messages.attach(content, messages.CONFIG, name, arrays)
+            encoded = encode(messages.unpack_arrays(content[messages.ARRAYS]), DOWNWARD[self.config.exchange])
+            content[messages.CONFIG][messages.DIGEST] = digest(encoded)
+            if self.config.exchange != "float32":
+                content[messages.ARRAYS] = messages.pack_arrays(encoded)
+        addressed = {message.metadata.dst_node_id for message in sent}
+        self._sampled = [node for node in self._sampled if node in addressed]
         self._sent_bytes = sum(messages.count_bytes(message.content) for message in sent)
         return sent
 
+    @contextmanager
+    def _in_flower(self, server_round: int) -> Iterator[None]:
+        """Fix the global generators that Flower draws from, unless noise is secret; its refusals become ValueErrors."""
+        try:
+            with nullcontext() if self.config.secret_noise else seeded(self.config.seed, server_round):
+                yield
+        except AppExitException as error:
+            raise ValueError(f"round {server_round}, strategy={self.config.strategy}: {error}") from error
+
     def _restore(self, reply: Message) -> None:
-        """Replace the encoded update in a reply by the arrays: global arrays plus update."""
-        node = reply.metadata.src_node_id
-        self._arrived[node] = {name: self._global[name] + change for name, change in self._arrived[node].items()}
-        reply.content[messages.ARRAYS] = messages.pack_arrays(self._arrived[node])
+        """Replace an encoded update in a reply by global arrays plus update; wrappers pair arrays by their place."""
+        node, record = reply.metadata.src_node_id, reply.content[messages.ARRAYS]
+        if self.config.exchange != "float32":
+            self._arrived[node] = {name: self._global[name] + change for name, change in self._arrived[node].items()}
+            record = messages.pack_arrays(self._arrived[node])
+        reply.content[messages.ARRAYS] = ArrayRecord({name: record[name] for name in self.shapes})
 
     def _protect(self, server_round: int, valid: list[Message]) -> None:
         """Clip what each client sent, unless it did so itself; with noise, put one noised mean in place of them all.
@@ -265,7 +296,8 @@ class Checked:
         return valid
 
     def _check_train(self, reply: Message) -> None:
-        _check_metrics(reply, messages.train_metrics(privacy.hides_updates(self.config)))
+        expected = messages.train_metrics(privacy.hides_updates(self.config))
+        _check_metrics(reply, (*expected, *getattr(self, "extra_metrics", ())))
         if _examples(reply) == 0:
             raise ParameterError("examples", f"{messages.EXAMPLES}=0: a client without training frames has no weight")
         steps = reply.content.metric_records[messages.METRICS][messages.STEPS]
