@@ -27,6 +27,7 @@ from fedvla_lib.evaluation import rollouts
 from fedvla_lib.evaluation.rollouts import FIRST_SEED
 from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.portable import export
 from report import laptop, options, report, start, timed
 
 VIDEOS = 10  # fixed in lerobot-eval

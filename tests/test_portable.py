@@ -22,8 +22,8 @@ pytestmark = pytest.mark.integration
 CONFIG = from_profile("tiny", base="nano-random", num_threads=1)
 STATS = {key: {"mean": np.arange(6.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
 
-# What somebody does who has LeRobot and the folder, nothing else: load, and ask for one chunk. argv: seed, then pairs of a
-# working directory and the folder to load there.
+# What somebody does who has LeRobot and the folder, nothing else: load, and ask for one chunk. argv: pairs of a working
+# directory and the folder to load there.
 STRANGER = """
 import importlib.util, json, os, sys
 sys.modules["fedvla_lib"] = None  # importing it fails, as on a machine without it

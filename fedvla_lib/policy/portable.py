@@ -3,7 +3,7 @@
 A ``pretrained_model`` folder holds the backbone's config and tokenizer in ``vlm``, and two of its files name it.
 LeRobot 0.6.1 passes that name to transformers as it stands, without the folder that it was read from, and transformers
 looks for a relative name in the working directory, then on the hub (`cached_files` in ``transformers/utils/hub.py``).
-So a saved policy names ``vlm``: this library finds it wherever the folder is, LeRobot's commands from inside the folder.
+So a saved policy names ``vlm``: this library finds it wherever the folder is, LeRobot's commands from inside it.
 `export` writes the copy that they load from any working directory, which has to name the place where it will be.
 """
 
@@ -29,7 +29,7 @@ def name_backbone(folder: Path, name: str) -> None:
 
 
 def export(policy: Path, place: str, out: Path | None = None) -> Path:
-    """Copy a saved policy so that LeRobot loads it from `place` whatever the working directory; return the copy's folder.
+    """Copy a saved policy so that LeRobot loads it from `place`, whatever the working directory; return the folder.
 
     Args:
         place: where the copy will be when it is loaded; an absolute path if that is on another machine.
