@@ -45,7 +45,8 @@ FENCES = {
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },
     "lerobot": {
-        "robot.lerobot_env", "data.episode_writer", "data.lerobot_reader", "data.normalisation",
+        "robot.lerobot_env", "robot.lerobot_robot", "robot.lerobot_teleoperator", "robot.config_lerobot_robot",
+        "robot.config_lerobot_teleoperator", "data.episode_writer", "data.lerobot_reader", "data.normalisation",
         "policy.lean_expert", "policy.model", "policy.prefix_cache", "policy.training",
     },
     "transformers": {"policy.prefix_cache"},

@@ -195,24 +195,23 @@ class So100SimRobot(SOFollower):
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
         self.connected[self.id] = self
-        self._scene = -1
+        self._seed = None
         self.next_scene()
 
     def next_scene(self) -> int:
         """Put the objects of the next scene on the table and the arm into its start pose; return the scene's seed."""
-        self.report()
-        self._scene += 1
-        seed, pose = self.config.seed + self._scene, self.config.start_pose
-        self.env.reset(seed=seed, options=None if pose is None else {"joints": pose})
+        self._report()
+        self._seed = self.config.seed if self._seed is None else self._seed + 1
+        pose = self.config.start_pose
+        self.env.reset(seed=self._seed, options=None if pose is None else {"joints": pose})
         self.bus.start()
         self._streak, self.solved = 0, False
-        return seed
+        return self._seed
 
-    def report(self) -> None:
-        """Log whether the scene's task was solved."""
-        if self._scene >= 0 and self.bus.actions:
+    def _report(self) -> None:
+        if self.bus.actions:
             done = "solved" if self.solved else "not solved"
-            logger.info("%s: scene %d, %r %s", self, self._scene, self.env.instruction, done)
+            logger.info("%s: scene of seed %d, %r, %s", self, self._seed, self.env.instruction, done)
 
     def calibrate(self) -> None:
         """Write the calibration file to the motors, or, where there is none, the one that the motors have to a file."""
@@ -232,5 +231,5 @@ class So100SimRobot(SOFollower):
 
     def disconnect(self) -> None:
         super().disconnect()
-        self.report()
+        self._report()
         self.connected.pop(self.id, None)
