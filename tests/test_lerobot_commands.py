@@ -8,6 +8,8 @@ import importlib.metadata
 import json
 import logging
 import os
+import re
+import shlex
 import signal
 import socket
 import sys
@@ -156,7 +158,7 @@ def policy(place: Path) -> Path:
     model.save_policy(
         model.load_policy(from_profile("tiny", base="nano-random", num_threads=1), stats), place / "saved"
     )
-    return export(place / "saved", str(place / "policy"))
+    return export(place / "saved", str(place / "my_policy"))
 
 
 def test_the_distributions_are_found_by_name(place):
@@ -214,6 +216,20 @@ def test_rollout_moves_the_arm_with_a_policy(policy, said):
         "--device=cpu", "--play_sounds=false",
     )  # fmt: skip
     assert any("scene of seed 0" in line for line in said)
+
+
+def test_the_dry_run_of_the_safety_page_runs_as_it_stands(recorded, policy, said):
+    blocks = re.findall(
+        r"```bash\n(lerobot-\S+ --robot.type=so100_sim.*?)```",
+        (ROOT / "book/real_arm_safety.md").read_text(),
+        re.DOTALL,
+    )
+    assert [block.split()[0] for block in blocks] == ["lerobot-replay", "lerobot-rollout"]
+    for block in blocks:
+        command, *flags = shlex.split(block.replace("\\\n", " "))
+        short = ["--duration=1"] if command == "lerobot-rollout" else []
+        lerobot(f"scripts.{command.replace('-', '_')}", *flags, "--robot.calibration_dir=calibration", *short)
+    assert len([line for line in said if "scene of seed 0" in line]) == 2
 
 
 def test_train_continues_on_what_was_recorded(recorded, policy, place):
