@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from lerobot.configs.parser import load_plugin
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
@@ -24,6 +25,7 @@ def lift():
 
 
 def test_registered_under_its_name_with_the_features_of_our_data():
+    load_plugin("fedvla_lib.robot.lerobot_env")  # LeRobot's flag, for who has not installed the plugin
     config = make_env_config("so100_sim", image_size=SIZE)
     assert isinstance(config, So100SimConfig) and config.type == "so100_sim"
     features = env_to_policy_features(config)
