@@ -64,7 +64,7 @@ $(UV): requirements-uv.lock
 # The lock goes in as it stands, hashes checked. With TORCH_BACKEND a new environment gets torch first, from the wheels uv
 # chooses for that backend; they are other files with other hashes, so the rest of the lock follows without torch and its
 # CUDA libraries. The choice is remembered until .venv is removed.
-$(STAMP): $(LOCK) pyproject.toml $(UV)
+$(STAMP): $(LOCK) pyproject.toml $(wildcard plugins/*/*.py plugins/*/pyproject.toml) $(UV)
 	@$(if $(TORCH_BACKEND),rm -rf .venv,rm -f .venv/.installed*)
 	@test -x $(BIN)/python || $(UV) venv --quiet --python 3.12 .venv || $(UV) venv --python '>=3.12,<3.14' .venv
 ifeq ($(TORCH_BACKEND),)
@@ -76,7 +76,8 @@ else
 	$(UV) pip install --quiet --no-deps --require-hashes --python $(BIN)/python -r .venv/without-torch.lock
 	@echo $(TORCH_BACKEND) > .venv/.torch-backend
 endif
-	$(UV) pip install --quiet --no-deps --no-build-isolation --python $(BIN)/python --editable .
+	$(UV) pip install --quiet --no-deps --no-build-isolation --python $(BIN)/python --editable . \
+	  $(patsubst %,--editable ./%,$(wildcard plugins/*))
 	@touch $@
 
 doctor: $(STAMP)

@@ -27,6 +27,7 @@ from fedvla_lib.evaluation import rollouts
 from fedvla_lib.evaluation.rollouts import FIRST_SEED
 from fedvla_lib.policy import model
 from fedvla_lib.policy.actor import PolicyActor
+from fedvla_lib.policy.portable import export
 from report import laptop, options, report, start, timed
 
 VIDEOS = 10  # fixed in lerobot-eval
@@ -94,9 +95,9 @@ def ours(actor: SameNoise, config: Config, task: str, seeds: list[int], jobs: in
 def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes: bool) -> tuple[float, list[bool]]:
     """Run LeRobot's command; return the seconds that it reports, and the success of each rollout."""
     command = [
-        sys.executable, __file__, AS_LEROBOT, f"--policy.path={chosen.policy}",
+        sys.executable, __file__, AS_LEROBOT, f"--policy.path={export(chosen.policy, str(folder / 'policy'))}",
         "--policy.device=cpu", "--env.type=so100_sim", f"--env.task={chosen.task}",
-        f"--env.image_size={config.image_size}", "--env.discover_packages_path=fedvla_lib.robot.lerobot_env",
+        f"--env.image_size={config.image_size}",
         f"--eval.n_episodes={chosen.rollouts}", f"--eval.batch_size={chosen.batch}", f"--seed={FIRST_SEED}",
         f"--eval.use_async_envs={str(own_processes).lower()}", f"--output_dir={folder / 'out'}",
     ]  # fmt: skip

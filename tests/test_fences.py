@@ -45,8 +45,9 @@ FENCES = {
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },
     "lerobot": {
-        "robot.lerobot_env", "data.conversion", "data.episode_writer", "data.frame_store", "data.lerobot_reader",
-        "data.normalisation",
+        "robot.lerobot_env", "robot.lerobot_robot", "robot.lerobot_teleoperator", "robot.config_lerobot_robot",
+        "robot.config_lerobot_teleoperator", "data.conversion", "data.episode_writer", "data.frame_store",
+        "data.lerobot_reader", "data.normalisation",
         "policy.lean_expert", "policy.model", "policy.prefix_cache", "policy.training",
     },
     "transformers": {"policy.prefix_cache"},

@@ -37,7 +37,8 @@ def test_chapters_and_stored_results_lie_as_in_the_checkout(unpacked):
 def test_its_readme_names_what_is_there(unpacked):
     text = (unpacked / "README.txt").read_text()
     (wheel,) = unpacked.glob("*.whl")
-    assert wheel.name in text and "requirements.lock" in text and (unpacked / "requirements.lock").is_file()
+    assert f"{wheel.name} plugins/*.whl" in text and len([*unpacked.glob("plugins/lerobot_*.whl")]) == 3
+    assert "requirements.lock" in text and (unpacked / "requirements.lock").is_file()
 
 
 def test_chapters_run_from_the_wheel_and_one_that_does_not_fails(unpacked, tmp_path, capfd):

@@ -46,16 +46,16 @@ def unpack(book: Path, folder: Path) -> Path:
 
 
 def new_environment(book: Path) -> Path:
-    """Make an environment with the wheel and this environment's packages in an unpacked book, and return its Python.
+    """Make an environment with the wheels and this environment's packages in an unpacked book, and return its Python.
 
     .pth files in the folder that others.pth points to are not read, so an editable install is not followed.
     """
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(book / ".venv")], check=True)
     python = book / ".venv" / "bin" / "python"
     (packages,) = (book / ".venv").glob("lib/python*/site-packages")
-    (wheel,) = book.glob("*.whl")
-    with ZipFile(wheel) as library:
-        library.extractall(packages)
+    for wheel in book.rglob("*.whl"):
+        with ZipFile(wheel) as library:
+            library.extractall(packages)
     (packages / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for program in entry_points(group="console_scripts"):
         if program.module.split(".")[0] in ("flwr", "fedvla_lib"):  # programs that chapters start

@@ -29,7 +29,7 @@ Install, in this folder:
 
     python3 -m venv .venv
     .venv/bin/python -m pip install --no-deps --require-hashes -r requirements.lock
-    .venv/bin/python -m pip install --no-deps {wheel}
+    .venv/bin/python -m pip install --no-deps {wheel} plugins/*.whl
 
 Check the machine, record the demonstrations (minutes), and start with chapter 1:
 
@@ -51,11 +51,26 @@ def build_wheel(root: Path, folder: Path) -> Path:
             shutil.copytree(root / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
         for file in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copy(root / file, source)
-        command = [sys.executable, "-c", BUILD, str(folder.resolve())]
-        done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+        return _build(source, folder)
+
+
+def build_plugins(root: Path, folder: Path) -> list[Path]:
+    """Build the wheels by which LeRobot finds the simulated arm into `folder`; raise ValueError as `build_wheel`."""
+    wheels = []
+    for plugin in sorted((root / "plugins").iterdir()):
+        with tempfile.TemporaryDirectory(prefix="fedvla-wheel-") as source:
+            copied = shutil.copytree(plugin, source, ignore=shutil.ignore_patterns("*.egg-info"), dirs_exist_ok=True)
+            wheels.append(_build(copied, folder))
+    return wheels
+
+
+def _build(source: Path, folder: Path) -> Path:
+    before = set(folder.glob("*.whl"))
+    command = [sys.executable, "-c", BUILD, str(folder.resolve())]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     if done.returncode:
         raise ValueError(f"the wheel was not built: {' '.join(done.stderr.split())[-400:]}")
-    (wheel,) = folder.glob("*.whl")
+    (wheel,) = set(folder.glob("*.whl")) - before
     return wheel
 
 
@@ -65,6 +80,8 @@ def make(root: Path, target: Path) -> Path:
     with temporary as folder, new_file(target) as draft, ZipFile(draft, "w", ZIP_DEFLATED) as book:
         wheel = build_wheel(root, Path(folder))
         book.write(wheel, f"{target.stem}/{wheel.name}")
+        for plugin in build_plugins(root, Path(folder)):
+            book.write(plugin, f"{target.stem}/plugins/{plugin.name}")
         for path in _packed(root):
             book.write(path, f"{target.stem}/{path.relative_to(root).as_posix()}")
         book.writestr(f"{target.stem}/README.txt", _readme(root, wheel.name))

@@ -222,6 +222,13 @@ def _print_rounds(folder: Path) -> None:
     print(*read_metrics(folder, kind="note").get("detail", []), folder, sep="\n")
 
 
+def export(options: argparse.Namespace) -> None:
+    """Copy a saved policy for LeRobot's commands and print its folder."""
+    from fedvla_lib.policy.portable import export as write_export
+
+    print(write_export(options.policy, options.place, options.out))
+
+
 def experiment(options: argparse.Namespace) -> None:
     """Run the unfinished cells of an experiment and print what each cell reached and cost."""
     import pandas as pd

@@ -144,6 +144,12 @@ COMMANDS = (  # handler, help, what Ctrl-C keeps, flags
         _flag("--out", "the folder for videos and rows.csv (default: none)", "DIR"),
         _flag("--seed", "seed of the policy's noise (default: 0)", type=int, default=0), _jobs("groups of rollouts"),
     ]),
+    (commands.export, "copy a saved policy so that LeRobot's commands load it from any working directory", NOTHING, [
+        _flag("policy", "a pretrained_model folder, such as <run>/global_model/round_4", type=Path),
+        _flag("--for", "where the copy will be when it is loaded; its files name this place", "PLACE", dest="place",
+              **NEEDED),
+        _flag("--out", "the folder to write, if PLACE is on another machine (default: PLACE)", "DIR"),
+    ]),
     (commands.experiment, "train and measure a grid of methods, partitions and seeds",
      f"finished cells are kept, {CONTINUES}", [
         _flag("file", "the plan, a TOML file; see fedvla_lib/experiments/experiment_file.py", type=Path),

@@ -31,6 +31,7 @@ from fedvla_lib.policy.gradient_checkpoints import recompute_activations
 from fedvla_lib.policy.lora import add_adapters, merged
 from fedvla_lib.policy.nano import NANO, NANO_RANDOM, VLM_FOLDER, WEIGHTS_FILE, ensure_nano, nano_base
 from fedvla_lib.policy.parameters import Arrays, layer_of, trainable, trainable_arrays
+from fedvla_lib.policy.portable import name_backbone
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, NUM_JOINTS, STATE_KEY, image_key
 
 UNREADABLE = (
@@ -128,6 +129,8 @@ def _own(policy: SmolVLAPolicy, parts: list[str]) -> Arrays:
 def save_policy(bundle: Bundle, folder: Path) -> None:
     """Write a LeRobot ``pretrained_model`` folder (config, safetensors, processors) atomically, with adapters merged.
 
+    It names no path, so it can be moved; `portable` says how LeRobot's own commands load it.
+
     Raises:
         FileExistsError: `folder` exists; nothing is overwritten.
         OSError: it cannot be written; the message names it.
@@ -146,6 +149,7 @@ def write_policy(bundle: Bundle, folder: Path) -> None:
     backbone = Path(bundle.policy.config.vlm_model_name)
     if backbone.is_dir():
         shutil.copytree(backbone, folder / VLM_FOLDER)
+        name_backbone(folder, VLM_FOLDER)
 
 
 def _random_nano(config: Config) -> SmolVLAPolicy:

@@ -81,7 +81,6 @@ def pretrain(recipe: Recipe, out: Path, progress: bool = True) -> Path:
     report["stamp"] = stamp | {"status": "completed", "wall_s": time.perf_counter() - began}
     with new_folder(out.absolute()) as draft:
         model.write_policy(bundle, draft)
-        _make_backbone_relative(draft, bundle.policy.config.vlm_model_name)
         write_json(draft / CARD_FILE, report)
     return out
 
@@ -113,12 +112,6 @@ def _check(recipe: Recipe) -> None:
     for name, value in asdict(recipe).items():
         if value < 0 or (value == 0 and name not in ("jitter", "seed")):
             raise ValueError(f"{name.replace('_', '-')}={value} is not usable: give a number above 0")
-
-
-def _make_backbone_relative(folder: Path, backbone: str) -> None:
-    """Replace the absolute path of the backbone in the saved files by its folder beside them."""
-    for path in sorted(folder.glob("*.json")):
-        path.write_text(path.read_text().replace(json.dumps(backbone), json.dumps(nano.VLM_FOLDER)))
 
 
 def measure(bundle: model.Bundle, recipe: Recipe, progress: bool = True) -> list[dict[str, Any]]:

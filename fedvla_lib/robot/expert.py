@@ -19,7 +19,7 @@ from fedvla_lib.robot.operators import Operator
 from fedvla_lib.robot.rollout import run_episode
 from fedvla_lib.robot.scene import GRASP_SITE, build_arm
 from fedvla_lib.robot.sim import So100Env, from_radians, to_radians
-from fedvla_lib.robot.spec import NUM_JOINTS, Observation
+from fedvla_lib.robot.spec import FPS, NUM_JOINTS, Observation
 
 OPEN, CLOSED = 34.0, 4.0  # gripper commands
 FORK = 13.0  # gripper command at which both finger tips push one face of the cube
@@ -56,17 +56,20 @@ class Waypoint:
 
 
 class Expert:
-    """An `Actor` for every task; reads the true layout from the environment at the start of an episode."""
+    """An `Actor` for every task; reads the true layout from the environment at the start of an episode.
 
-    def __init__(self) -> None:
-        self._arm = _Arm()
+    `fps`: control steps per second. With more of them the path is the same, in smaller steps.
+    """
+
+    def __init__(self, fps: int = FPS) -> None:
+        self._arm, self._fps = _Arm(), fps
 
     def reset(self, env: Any, seed: int) -> None:
         """Plan the episode in `env`, a `So100Env` that has just been reset; `seed` fixes what its operator does."""
         sim: So100Env = env.unwrapped
         self._offset = sim.joint_offset  # the plan is in true angles, commands are in reported ones
         start = _Plan(self._arm.start(sim.joints - self._offset), sim.lab.operator, np.random.default_rng(seed))
-        self._path = _interpolate(PLANS[sim.task](start, sim.layout, sim.layout.cubes[0]))
+        self._path = _interpolate(PLANS[sim.task](start, sim.layout, sim.layout.cubes[0]), self._fps)
         self._step = 0
 
     def act(self, observation: Observation) -> np.ndarray:
@@ -74,6 +77,11 @@ class Expert:
         target = self._path[min(self._step, len(self._path) - 1)]
         self._step += 1
         return self._arm.solve(target) + self._offset
+
+    @property
+    def steps_left(self) -> int:
+        """Control steps until the plan's end."""
+        return max(0, len(self._path) - self._step)
 
 
 def expert_success(task: str, seeds: Iterable[int]) -> list[dict[str, Any]]:
@@ -117,12 +125,14 @@ class _Arm:
         return joints
 
 
-def _interpolate(plan: list[Waypoint]) -> list[Waypoint]:
+def _interpolate(plan: list[Waypoint], fps: int) -> list[Waypoint]:
     """Return one waypoint per control step, along straight lines with smooth acceleration and braking."""
     path = []
     for begin, end in pairwise(plan):
         before, after = (np.array([*one.position_m, one.yaw_rad, one.gripper]) for one in (begin, end))
-        for progress in (_smooth(step / end.steps) for step in range(1, end.steps + 1)):
+        steps = max(1, round(end.steps * fps / FPS))
+        paced = _smooth if end.steps > 1 else float  # an arc's points, a control step apart, are smooth as they stand
+        for progress in (paced(step / steps) for step in range(1, steps + 1)):
             *position_m, yaw_rad, gripper = (1 - progress) * before + progress * after
             path.append(Waypoint(tuple(position_m), yaw_rad, gripper, 1))
     return path

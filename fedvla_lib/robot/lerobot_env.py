@@ -1,9 +1,10 @@
-r"""The simulated SO-100 for LeRobot's command-line tools: importing this module registers ``so100_sim``.
+r"""The simulated SO-100 as an environment of LeRobot: importing this module registers ``so100_sim``.
 
-LeRobot imports the module named by its plugin flag before it parses the rest of the command line::
+LeRobot imports it where the distribution ``lerobot_env_so100_sim`` is installed, as ``make`` does::
 
-    lerobot-eval --policy.path=FOLDER --env.type=so100_sim --env.task=lift,place \
-        --env.discover_packages_path=fedvla_lib.robot.lerobot_env --eval.n_episodes=20 --eval.batch_size=1
+    lerobot-eval --policy.path=FOLDER --env.type=so100_sim --env.task=lift,place --eval.n_episodes=20
+
+Elsewhere add ``--env.discover_packages_path=fedvla_lib.robot.lerobot_env``.
 """
 
 from dataclasses import dataclass, replace

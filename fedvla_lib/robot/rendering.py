@@ -21,9 +21,9 @@ class SceneRenderer(mujoco.Renderer):
     The pixels are those of drawing all at once, as long as nothing is transparent.
     """
 
-    def __init__(self, model: mujoco.MjModel, size: int) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         try:
-            super().__init__(model, size, size, max_geom=model.ngeom + model.nsite)  # MuJoCo's 10,000 take 15 ms
+            super().__init__(model, height, width, max_geom=model.ngeom + model.nsite)  # MuJoCo's 10,000 take 15 ms
         except (mujoco.FatalError, RuntimeError, AttributeError) as error:  # which one depends on the driver
             raise RuntimeError(
                 f"cannot render off screen with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({error}): set MUJOCO_GL "
@@ -37,7 +37,7 @@ class SceneRenderer(mujoco.Renderer):
         atexit.register(_close, weakref.ref(self))
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """Return the image, uint8 (size, size, 3); `model` must have the meshes of the model given at creation."""
+        """Return the image, uint8 (height, width, 3); `model` must have the meshes of the model given at creation."""
         self._view.fixedcamid = model.camera(camera).id
         with garbage_collection_paused():
             self._gl_context.make_current()
@@ -65,8 +65,8 @@ class SceneRenderer(mujoco.Renderer):
         """Draw what is fixed to the world (mjCAT_STATIC), with the sky, or what is not (mjCAT_DYNAMIC).
 
         Returns:
-            From the lowest row up: the colours, uint8 (size, size, 3), and float32 (size, size) that is larger for
-            nearer points, and 0 where nothing is.
+            From the lowest row up: the colours, uint8 (height, width, 3), and float32 (height, width) that is
+            larger for nearer points, and 0 where nothing is.
         """
         self.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = category == mujoco.mjtCatBit.mjCAT_STATIC
         mujoco.mjv_updateScene(model, data, self._options, None, self._view, category, self.scene)

@@ -133,7 +133,8 @@ class So100Env(gymnasium.Env):
         self.data.qpos[:NUM_JOINTS] = self.data.ctrl[:] = to_radians(start, self._limits_rad)
         scene.place_objects(self.model, self.data, self.layout, self.lab)
         mujoco.mj_forward(self.model, self.data)
-        self._step_count = self._streak = 0
+        self._step_count = self._streak = self._unmeasured = 0
+        self._touched: set[tuple[str, str]] = set()
         cubes = scene.CUBES[: len(self.layout.cubes)]
         self._states = [TaskState(start_m=tuple(self.data.body(name).xpos.tolist())) for name in cubes]
         self._needs_reset = False
@@ -146,27 +147,41 @@ class So100Env(gymnasium.Env):
             ValueError: `action` is not six finite numbers.
             RuntimeError: the episode is over or was never started.
         """
-        target = _check_joints(action, "action") - self.joint_offset
         if self._needs_reset:
             raise RuntimeError("the episode is over: call reset() before step()")
-        low, high = self.action_space.low, self.action_space.high
-        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self._limits_rad)
-        touched = self._advance()
-        now = self._touching()
-        self._states = [self._measure(index, before, touched, now) for index, before in enumerate(self._states)]
-        first, *others = self._states
-        self._streak = self._streak + 1 if self._task.success(replace(first, others=tuple(others))) else 0
+        self._streak = self._streak + 1 if self.move(action) else 0
         self._step_count += 1
         terminated = self._streak >= self._task.hold_steps
         truncated = not terminated and self._step_count >= self._max_episode_steps
         self._needs_reset = terminated or truncated
         return self._observation(), float(terminated), terminated, truncated, {"is_success": terminated}
 
+    def move(self, joints: np.ndarray, substeps: int = SUBSTEPS) -> bool:
+        """Hold joint targets, (6,), LeRobot units, for some time steps of the simulation, in an episode or after it.
+
+        Returns:
+            Whether the task's success predicate holds; it is measured at 10 Hz, whatever the length of a move.
+
+        Raises:
+            ValueError: `joints` is not six finite numbers.
+        """
+        target = _check_joints(joints, "action") - self.joint_offset
+        low, high = self.action_space.low, self.action_space.high
+        self.data.ctrl[:] = to_radians(np.clip(target, low, high), self._limits_rad)
+        self._touched |= self._advance(substeps)
+        self._unmeasured += substeps
+        if self._unmeasured >= SUBSTEPS:
+            now = self._touching()
+            self._states = [self._measure(i, before, self._touched, now) for i, before in enumerate(self._states)]
+            self._touched, self._unmeasured = set(), 0
+        first, *others = self._states
+        return self._task.success(replace(first, others=tuple(others)))
+
     def camera_images(self, cameras: Sequence[str] = CAMERAS) -> dict[str, np.ndarray]:
         """Render the current scene: camera -> uint8 (size, size, 3)."""
         owner = self._renderer_of or self
         if owner._renderer is None:
-            owner._renderer = SceneRenderer(owner.model, owner.image_size)
+            owner._renderer = SceneRenderer(owner.model, owner.image_size, owner.image_size)
         return {camera: owner._renderer.draw(self.model, self.data, camera) for camera in cameras}
 
     def render(self) -> np.ndarray | None:
@@ -181,10 +196,10 @@ class So100Env(gymnasium.Env):
             self._renderer.close()
             self._renderer = None
 
-    def _advance(self) -> set[tuple[str, str]]:
-        """Simulate one control step; return what touched during it, see `_touching`."""
+    def _advance(self, substeps: int = SUBSTEPS) -> set[tuple[str, str]]:
+        """Simulate some time steps; return what touched during them, see `_touching`."""
         touched = set()
-        for _ in range(SUBSTEPS):
+        for _ in range(substeps):
             mujoco.mj_step(self.model, self.data)
             touched |= self._touching()
         mujoco.mj_forward(self.model, self.data)  # update positions and contacts to the final state
