@@ -9,12 +9,11 @@ import os
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 from fedvla_lib.config import Config, from_profile, split_names, to_run_config
-from fedvla_lib.files import read_json, write_atomically
+from fedvla_lib.files import write_atomically
 from fedvla_lib.pretraining.recipe import Recipe
-from fedvla_lib.robot.spec import CAMERAS, image_key
 from fedvla_lib.robot.tasks import TASKS, check_tasks
 
 FAILED = 2  # exit status: bad input, or a run that failed
@@ -22,14 +21,6 @@ DOWN = 3  # exit status of service managers for a service that is not running
 DAMAGED = 1  # exit status: some of the files are damaged, or data have errors
 LOCAL = "local"  # engine, and `who` in measurements, without a federation
 SETTINGS = {field.name for field in fields(Config)} - {"resume"}
-
-
-class SavedPolicy(TypedDict):
-    """What is read from a policy's ``config.json``."""
-
-    input_features: dict[str, dict[str, Any]]
-    chunk_size: int
-    n_action_steps: int
 
 
 def settings(options: argparse.Namespace, **overrides: Any) -> Config:
@@ -263,11 +254,12 @@ def _jobs(options: argparse.Namespace, device: str) -> int:
 def evaluate(options: argparse.Namespace) -> None:
     """Roll out a saved policy and print its success rates by task."""
     from fedvla_lib.evaluation import rollouts
+    from fedvla_lib.policy import portable
     from fedvla_lib.policy.actor import PolicyActor
     from fedvla_lib.policy.model import load_policy
 
     tasks = check_tasks(options.task or list(TASKS))
-    chosen = _saved_settings(options.policy)
+    chosen = portable.saved_settings(options.policy)
     actor = PolicyActor(load_policy(chosen), options.seed)
     seeds, videos = rollouts.rollout_seeds(options.rollouts), options.out and options.out / "videos"
     settings_of = {"image_size": chosen.image_size, "videos_dir": videos, "jobs": _jobs(options, chosen.device)}
@@ -324,22 +316,6 @@ def videos(options: argparse.Namespace) -> int:
     for line in damaged:
         print(f"fedvla videos: {line}", file=sys.stderr)
     return DAMAGED if damaged else 0
-
-
-def _saved_settings(folder: Path) -> Config:
-    """Return settings that load the policy saved in `folder` as it was trained.
-
-    Raises:
-        ValueError: not a pretrained_model folder, or a policy without our cameras.
-    """
-    if not (file := folder / "config.json").is_file():
-        raise ValueError(f"{folder} is not a pretrained_model folder: it has no config.json")
-    saved = read_json(file, SavedPolicy)
-    shape = saved["input_features"].get(image_key(CAMERAS[0]), {}).get("shape")
-    if not shape:
-        raise ValueError(f"{folder} has no camera {CAMERAS[0]!r}: the simulator shows {', '.join(CAMERAS)}")
-    chunk = {name: saved[name] for name in ("chunk_size", "n_action_steps")}
-    return replace(Config(), base=str(folder), image_size=shape[-1], **chunk)
 
 
 def _print_success(rows: list[dict[str, Any]], csv: Path | None = None) -> None:
