@@ -134,14 +134,14 @@ def check(recorded: Recorded, beside: Recorded | None, remove: Remove, edit: str
     takes, fps, images = recorded.takes, recorded.outline.info["fps"], recorded.images
     found = [
         *episode_checks.timing(takes, fps, remove), *episode_checks.lengths(takes, remove),
-        *episode_checks.duplicates(takes, remove), *episode_checks.stuck(takes, fps, remove),
-        *episode_checks.instructions(takes, edit),
+        *episode_checks.duplicates(takes, remove), *episode_checks.instructions(takes, edit),
         *camera_checks.dark(takes, images, remove), *camera_checks.frozen(takes, images, fps, remove),
         *camera_checks.swapped(takes, images, beside and beside.images, recorded.outline.cameras, remove),
     ]  # fmt: skip
     if other := episode_checks.units(takes):
         return found + other
-    found += episode_checks.jumps(takes, fps, remove) + episode_checks.ranges(takes) + episode_checks.following(takes)
+    found += episode_checks.stuck(takes, fps, remove) + episode_checks.jumps(takes, fps, remove)
+    found += episode_checks.ranges(takes) + episode_checks.following(takes)
     return found + (episode_checks.shift(takes, beside.takes) if beside and beside.takes else [])
 
 
