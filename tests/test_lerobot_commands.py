@@ -44,7 +44,7 @@ pytestmark = pytest.mark.integration
 ROOT = Path(__file__).parents[1]
 PLUGINS = {"lerobot_env_so100_sim", "lerobot_robot_so100_sim", "lerobot_teleoperator_so100_script"}
 FPS, EPISODE_S, RESET_S = 30, 3, 1
-TASK = "Lift the cube."
+TASK = "Lift the red cube."
 CAMERAS = {
     name: OpenCVCameraConfig(index_or_path=index, fps=FPS, width=160, height=120)
     for index, name in enumerate(("overhead", "front"))
@@ -114,6 +114,7 @@ def lerobot(module: str, *arguments: object) -> None:
 ROBOT = (
     "--robot.type=so100_sim",
     "--robot.id=arm",
+    "--robot.color=red",
     f"--robot.cameras={CAMERA_FLAG}",
     "--robot.calibration_dir=calibration",
 )
@@ -215,7 +216,7 @@ def test_rollout_moves_the_arm_with_a_policy(policy, said):
         "scripts.lerobot_rollout", *ROBOT, f"--policy.path={policy}", f"--task={TASK}", "--duration=1", f"--fps={FPS}",
         "--device=cpu", "--play_sounds=false",
     )  # fmt: skip
-    assert any("scene of seed 0" in line for line in said)
+    assert any(f"scene of seed 0, '{TASK}'" in line for line in said)
 
 
 def test_the_dry_run_of_the_safety_page_runs_as_it_stands(recorded, policy, said):
@@ -411,6 +412,7 @@ def camera(**changed: object) -> OpenCVCameraConfig:
     ("settings", "message"),
     [
         ({"task": "juggle"}, "unknown task 'juggle'"),
+        ({"color": "pink"}, "robot.color='pink' is not usable: choose one of red, green, blue"),
         ({"fps": 0}, "robot.fps=0 is not usable: give a number from 1 to 200"),
         ({"lab": -1}, "robot.lab=-1"),
         ({"start_pose": [1.0]}, r"start_pose=\[1.0\] is not usable: give 6 numbers"),

@@ -9,6 +9,7 @@ from lerobot.cameras.opencv import OpenCVCameraConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.so_follower.config_so_follower import SOFollowerConfig
 
+from fedvla_lib.robot.layout import COLORS
 from fedvla_lib.robot.spec import CAMERAS, NUM_JOINTS
 from fedvla_lib.robot.tasks import check_tasks
 
@@ -25,6 +26,7 @@ class So100SimRobotConfig(RobotConfig, SOFollowerConfig):
 
     port: str = "simulation"  # not opened
     task: str = "lift"  # whose cubes and zones are on the table
+    color: str | None = None  # of the first cube in every scene, as --dataset.single_task names it; None draws one
     seed: int = 0  # of the first scene, layout and start pose; every further scene takes the next number
     lab: int = 0  # which lab's cameras, light, colours and calibration; 0 is the reference lab
     fps: int = 30  # actions in a second of simulated time: the value of --dataset.fps or --fps
@@ -33,6 +35,8 @@ class So100SimRobotConfig(RobotConfig, SOFollowerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_tasks([self.task])
+        if self.color not in (None, *COLORS):
+            raise ValueError(f"robot.color={self.color!r} is not usable: choose one of {', '.join(COLORS)}")
         if not 1 <= self.fps <= FPS_LIMIT:
             raise ValueError(f"robot.fps={self.fps} is not usable: give a number from 1 to {FPS_LIMIT}")
         if self.lab < 0:

@@ -202,8 +202,8 @@ class So100SimRobot(SOFollower):
         """Put the objects of the next scene on the table and the arm into its start pose; return the scene's seed."""
         self._report()
         self._seed = self.config.seed if self._seed is None else self._seed + 1
-        pose = self.config.start_pose
-        self.env.reset(seed=self._seed, options=None if pose is None else {"joints": pose})
+        given = {"color": self.config.color, "joints": self.config.start_pose}
+        self.env.reset(seed=self._seed, options={name: value for name, value in given.items() if value is not None})
         self.bus.start()
         self._streak, self.solved = 0, False
         return self._seed
