@@ -130,7 +130,7 @@ test: doctor lint
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
 	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
 
-# The profile `gpu` with random weights: on the CPU, which takes some minutes and 8 GB, or on a card.
+# The profile `gpu` with random weights: on the CPU, which takes 9 GB and up to half an hour, or on a card.
 test-full-size: $(STAMP)
 	$(BIN)/pytest -m full_size -s
 

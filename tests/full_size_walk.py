@@ -19,6 +19,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.smolvla import SmolVLAPolicy
 
+from fedvla_book.full_size import BACKBONE
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config, from_profile
 from fedvla_lib.data.batches import batch_of_rows
@@ -50,10 +51,14 @@ def settings(device: str, folder: Path, **kind: object) -> Config:
 
 
 def predict(saved: Path, config: Config) -> torch.Tensor:
-    """Return the chunk that LeRobot's policy, loaded by LeRobot, predicts for the first frame, in degrees."""
+    """Return the chunk that LeRobot's policy, loaded by LeRobot, predicts for the first frame, in degrees.
+
+    As saved, LeRobot would load the backbone's own weights first, to overwrite them: without them, its types differ.
+    """
     chosen = PreTrainedConfig.from_pretrained(saved)
+    assert chosen.load_vlm_weights and chosen.vlm_model_name == BACKBONE
     chosen.load_vlm_weights, chosen.device = False, config.device
-    policy = SmolVLAPolicy.from_pretrained(saved, config=chosen).eval()
+    policy = SmolVLAPolicy.from_pretrained(saved, config=chosen).float().eval()
     before, after = make_pre_post_processors(
         chosen, pretrained_path=str(saved), preprocessor_overrides={"device_processor": {"device": config.device}}
     )
@@ -74,12 +79,12 @@ def main(device: str, folder: Path) -> None:
         replies = run_folder.read_metrics(root, "replies").query("to == 'train'").iloc[0]
         print(f"{name}: step {trained.seconds[0]:.0f} s, {replies.received_bytes / 1e6:.1f} MB sent, "
               f"loss {trained.loss[0]:.2f}", flush=True)  # fmt: skip
-        moved = run_folder.read_metrics(root, "drift").query("who != @GLOBAL")["norm.all"].iloc[0]
+        moved = run_folder.read_metrics(root, "drift").query(f"who != {GLOBAL!r}")["norm.all"].iloc[0]
         assert trained.loss[0] > 0 < moved and run_folder.read_metrics(root, "rejected").empty
     with measured("LeRobot: load and predict", device):
         chunk = predict(root / "global_model" / "round_1", config)
     assert chunk.shape == (1, 50, 6) and torch.isfinite(chunk).all()
-    print(f"walked {GLOBAL}", flush=True)
+    print("walked", flush=True)
 
 
 if __name__ == "__main__":

@@ -144,9 +144,11 @@ def save_policy(bundle: Bundle, folder: Path) -> None:
 
 def write_policy(bundle: Bundle, folder: Path) -> None:
     """Write the files of a ``pretrained_model`` folder into `folder`, an existing draft."""
+    backbone = Path(bundle.policy.config.vlm_model_name)
+    # Of a hub's bfloat16 backbone, LeRobot makes a policy of mixed types unless it loads that one's weights, too.
+    bundle.policy.config.load_vlm_weights = not backbone.is_dir()
     for part in (merged(bundle.policy), bundle.preprocess, bundle.postprocess):
         part.save_pretrained(folder)
-    backbone = Path(bundle.policy.config.vlm_model_name)
     if backbone.is_dir():
         shutil.copytree(backbone, folder / VLM_FOLDER)
         name_backbone(folder, VLM_FOLDER)
