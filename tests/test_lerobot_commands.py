@@ -55,7 +55,7 @@ CAMERA_FLAG += "front: {type: opencv, index_or_path: 1, width: 160, height: 120,
 
 @pytest.fixture(scope="module", autouse=True)
 def plugins(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The three distributions, built built as for the zip and put on the path of this process alone."""
+    """The three distributions, built as for the zip and put on the path of this process alone."""
     folder = tmp_path_factory.mktemp("plugins")
     for wheel in build_plugins(ROOT, folder):
         zipfile.ZipFile(wheel).extractall(folder / "site")
