@@ -121,3 +121,15 @@ def test_mixed_precision_trains_nearly_the_same_and_exchanges_float32(augment, t
 @pytest.mark.unit
 def test_the_gpu_profile_uses_the_card_and_mixed_precision():
     assert PROFILES["gpu"]["mixed_precision"] and PROFILES["gpu"]["device"] == "cuda"
+
+
+@pytest.mark.integration
+def test_lerobot_is_told_to_load_the_weights_of_a_backbone_on_the_hub(tmp_path):
+    """Without them it would make parts of the policy in bfloat16 and others in float32, which cannot be computed."""
+    bundle = model.load_policy(from_profile("tiny"))
+    for backbone in (bundle.policy.config.vlm_model_name, full_size.BACKBONE):
+        bundle.policy.config.vlm_model_name = backbone
+        model.save_policy(bundle, tmp_path / backbone.replace("/", "-"))
+    own, hub = (json.loads(file.read_text()) for file in sorted(tmp_path.glob("*/config.json")))
+    saved = {one["vlm_model_name"]: one["load_vlm_weights"] for one in (own, hub)}
+    assert saved.pop(full_size.BACKBONE) and list(saved.values()) == [False]
