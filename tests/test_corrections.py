@@ -54,7 +54,7 @@ def quadratic_app(examples=(1, 1)) -> ClientApp:
         local_phase(weight, k, correction)
         arrays = {"w": weight.detach().numpy()}
         metrics = MetricRecord({messages.EXAMPLES: examples[k], messages.STEPS: 1, "loss": 0.0, "seconds": 0.0})
-        note = messages.make_note(sha256=digest(arrays))
+        note = ConfigRecord({messages.DIGEST: digest(arrays), **messages.round_of(message.content)})
         reply = RecordDict(
             {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: metrics, messages.NOTE: note}
         )

@@ -230,7 +230,7 @@ def change_arrays(change, *, honest: bool = True):
         arrays = change(messages.unpack_arrays(content[messages.ARRAYS]))
         content[messages.ARRAYS] = messages.pack_arrays(arrays)
         if honest:
-            content[messages.NOTE] = messages.make_note(sha256=digest(arrays))
+            content[messages.NOTE][messages.DIGEST] = digest(arrays)
 
     return damage
 

@@ -44,7 +44,7 @@ def served(tmp_path, updates, rounds=1, examples=1, **settings):
         arrays = messages.unpack_arrays(message.content[messages.ARRAYS])
         arrays = {"w": (arrays["w"] + updates[k]).astype(np.float32)}
         metrics = {messages.EXAMPLES: examples, messages.STEPS: 1, "loss": 0.0, "seconds": 0.0}
-        note = messages.make_note(sha256=digest(arrays))
+        note = ConfigRecord({messages.DIGEST: digest(arrays), **messages.round_of(message.content)})
         content = {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: MetricRecord(metrics)}
         return Message(RecordDict(content | {messages.NOTE: note}), reply_to=message)
 

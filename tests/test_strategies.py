@@ -24,6 +24,7 @@ from fedvla_lib.federation.messages import (
     checked_arrays,
     make_note,
     pack_arrays,
+    round_of,
     unpack_arrays,
 )
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, plain, wait_for_nodes
@@ -61,6 +62,8 @@ def answering(content_of) -> ClientApp:
     def train(message: Message, context: Context) -> Message:
         arrays = unpack_arrays(message.content[ARRAYS])
         content = content_of(context.node_config["partition-id"], arrays)
+        if NOTE in content:
+            content[NOTE] = ConfigRecord({**round_of(message.content), **content[NOTE]})
         return Message(RecordDict(content), reply_to=message)
 
     return app
@@ -383,6 +386,18 @@ def test_an_average_that_overflows_ends_the_run_although_each_reply_is_finite(se
         one_round(answering(lambda k, _: reply_content(huge)), 2, server_round=4, **settings)
 
 
+def test_the_content_of_an_earlier_round_is_refused_by_name():
+    stored = {}
+
+    def again(k, _):
+        return {**reply_content(random_arrays(k)), **(stored if k == 0 else {})}
+
+    assert not one_round(answering(again), 3, server_round=1)[2].rejected()
+    stored[NOTE] = make_note(sha256=digest(random_arrays(0)), server_round=1)
+    _, _, events = one_round(answering(again), 3, server_round=2)
+    assert events.rejected() == {"client_0": "round"} and "is of round 1, expected 2" in events[0][3]["detail"]
+
+
 def test_a_reply_larger_than_it_can_need_is_refused_before_anything_is_unpacked():
     def huge(k, _):
         content = reply_content(GOOD)
@@ -442,16 +457,15 @@ def test_what_a_client_does_to_a_message_stays_with_the_client():
 def test_messages_carry_the_hash_that_clients_check():
     checked = []
 
-    def content(k, arrays):
-        checked.append(digest(arrays))
-        return reply_content(arrays)
-
     app = ClientApp()
 
     @app.train()
     def train(message, context):
         arrays = checked_arrays(message.content, CONFIG, shapes_of(GOOD))
-        return Message(RecordDict(content(0, arrays)), reply_to=message)
+        checked.append(digest(arrays))
+        content = reply_content(arrays)
+        content[NOTE].update(round_of(message.content))
+        return Message(RecordDict(content), reply_to=message)
 
     _, _, events = one_round(app, 2, start=GOOD)
     assert events.rejected() == {}

@@ -73,7 +73,9 @@ def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None =
     def evaluate(message: Message, context: Context) -> Message:
         client = _client(context, loaders)
         bundle = _policy(client, message, loaders, context)
-        return Message(_evaluated(client, bundle, message.content[messages.CONFIG][messages.ROUND]), reply_to=message)
+        content = _evaluated(client, bundle, message.content[messages.CONFIG][messages.ROUND])
+        content[messages.NOTE].update(messages.round_of(message.content))
+        return Message(content, reply_to=message)
 
     return app
 
@@ -158,7 +160,7 @@ def _release(content: RecordDict, message: Message, context: Context, config: Co
             del content[record]
         content.update({record: messages.pack_arrays(arrays) for record, arrays in payload.items()})
     digests = {messages.digest_key(record): digest(arrays) for record, arrays in payload.items()}
-    content[messages.NOTE] = ConfigRecord(digests)
+    content[messages.NOTE] = ConfigRecord(digests | messages.round_of(message.content))
 
 
 def _client(context: Context, loaders: Loaders) -> Client:

@@ -1,7 +1,7 @@
 """Messages between server and clients: the names of Flower's records, and packing and checking on either side.
 
 Server to client: ``arrays`` (global parameters) and ``config`` (round, digest, pooled statistics).
-Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (digest and everything else).
+Client to server: ``arrays``, ``metrics`` (numbers that Flower averages) and ``note`` (round, digest, everything else).
 SCAFFOLD adds ``control`` both ways, control variates, and some local optimisers ``second_moments``; both are checked
 like the arrays.
 """
@@ -117,6 +117,17 @@ def count_bytes(content: RecordDict) -> int:
     # Flower's `ConfigRecord.count_bytes` fails on an empty list or text.
     rest = RecordDict({name: record for name, record in content.items() if name not in content.array_records})
     return sum(record.count_bytes() for record in content.array_records.values()) + recorddict_to_proto(rest).ByteSize()
+
+
+def round_of(content: RecordDict) -> dict[str, Any]:
+    """Return the round of a server's message, as what a reply's note says of it."""
+    return {ROUND: content.config_records.get(CONFIG, {}).get(ROUND, 0)}
+
+
+def check_round(content: RecordDict, server_round: int) -> None:
+    """Raise ParameterError unless a reply's note names the round: another one's content was sent again."""
+    if (found := content.config_records.get(NOTE, {}).get(ROUND)) != server_round:
+        raise ParameterError("round", f"the reply is of round {found!r}, expected {server_round}")
 
 
 def make_note(**values: Any) -> ConfigRecord:

@@ -140,8 +140,7 @@ def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: flo
     roster = Roster({}, **asked)
     for reply in grid.send_and_receive(messages, timeout=timeout_s):  # of two with one number the first keeps it
         try:
-            check_size(answered(reply), MOST_BYTES)
-            roster.add(reply)
+            roster.add(answered(reply, MOST_BYTES))
         except ParameterError as error:
             values = {"to": "query", "reason": error.kind, "detail": plain(str(error))}
             report(0, f"node_{reply.metadata.src_node_id}", "rejected", values)
@@ -154,19 +153,18 @@ def plain(text: str) -> str:
     return words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."
 
 
-def answered(reply: Message | None) -> Message:
-    """Return `reply` if it has content; raise ParameterError for no reply or an error reply."""
+def answered(reply: Message | None, most_bytes: float) -> Message:
+    """Return `reply` if it has content, or raise ParameterError: for none, an error, or one larger than it could need.
+
+    Nothing of it is unpacked for that.
+    """
     if reply is None:
         raise ParameterError("silent", "no reply in time")
     if reply.has_error():
         raise ParameterError("error", plain(str(reply.error.reason)) or f"error code {reply.error.code}")
-    return reply
-
-
-def check_size(reply: Message, most_bytes: float) -> None:
-    """Raise ParameterError if a reply is larger than what it could need; nothing of it is unpacked for that."""
     if (found := count_bytes(reply.content)) > most_bytes:
         raise ParameterError("size", f"{found / 1e6:,.0f} MB, expected at most {most_bytes / 1e6:,.0f}")
+    return reply
 
 
 def _statistics(text: Any, num_examples: int) -> Stats:

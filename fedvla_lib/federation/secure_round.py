@@ -20,7 +20,7 @@ from flwr.serverapp import Grid
 from fedvla_lib.config import Config, from_run_config, sample_size
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation import secure_aggregation as secure
-from fedvla_lib.federation.nodes import MOST_BYTES, Report, TooFewReplies, answered, check_size
+from fedvla_lib.federation.nodes import MOST_BYTES, Report, TooFewReplies, answered
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, check_digest, digest
 from fedvla_lib.run_folder import GLOBAL
 
@@ -110,9 +110,7 @@ class SecureGrid:
         vectors, refused = {}, []
         for me, order in orders.items():
             try:
-                reply = answered(replies.get(me))
-                check_size(reply, MOST_BYTES + np.uint32().nbytes * size)
-                content = reply.content
+                content = answered(replies.get(me), MOST_BYTES + np.uint32().nbytes * size).content
                 if messages.METRICS not in content.metric_records:
                     raise ParameterError("metrics", f"there is no record {messages.METRICS!r}")
                 arrays = messages.unpack_arrays(content.array_records.get(messages.ARRAYS, {}))
@@ -194,7 +192,7 @@ def _mean_records(order: Message, mean: privacy.Payload) -> RecordDict:
     """Return what all replies of a round have in common: the global arrays plus the mean, and the digests."""
     start = messages.unpack_arrays(order.content[messages.ARRAYS])
     arrays = {name: array + mean[messages.ARRAYS][name] for name, array in start.items()}
-    note = messages.make_note(sha256=digest(arrays))
+    note = ConfigRecord({messages.DIGEST: digest(arrays), **messages.round_of(order.content)})
     content = RecordDict({messages.ARRAYS: messages.pack_arrays(arrays), messages.NOTE: note})
     for record, extra in mean.items():
         if record != messages.ARRAYS:

@@ -25,7 +25,7 @@ from fedvla_lib.evaluation import measure
 from fedvla_lib.federation import messages, privacy
 from fedvla_lib.federation.accountant import Ledger
 from fedvla_lib.federation.drift import geometry
-from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, check_size, plain
+from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, plain
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
 from fedvla_lib.federation.rollout_replies import Rollouts, unpack_rollouts
 from fedvla_lib.policy.optimizers import SHARING
@@ -276,17 +276,17 @@ class Checked:
         valid, rejected = [], []
         for node in self._sampled:  # ordered by partition
             try:
-                check_size(answered(by_node.get(node)), self._most_bytes)
-                check(by_node[node])
+                check(reply := answered(by_node.get(node), self._most_bytes))
+                messages.check_round(reply.content, server_round)
             except ParameterError as error:
                 name, reason, detail = self.roster.name(node), error.kind, plain(str(error))
                 rejected.append(reason)
                 logger.warning("round %d: %s reply of %s rejected (%s): %s", server_round, kind, name, reason, detail)
                 self.report(server_round, name, "rejected", {"to": kind, "reason": reason, "detail": detail})
             else:
-                valid.append(by_node[node])
-                values = by_node[node].content.metric_records[messages.METRICS]
-                values = {key.replace("-", "_"): value for key, value in values.items()}
+                valid.append(reply)
+                numbers = reply.content.metric_records[messages.METRICS].items()
+                values = {key.replace("-", "_"): value for key, value in numbers}
                 self.report(server_round, self.roster.name(node), kind, values)
         counts = {f"rejected_{reason}": rejected.count(reason) for reason in sorted(set(rejected))}
         if self._sampled:
