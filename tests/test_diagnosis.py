@@ -1,4 +1,4 @@
-"""A policy with a good loss that fails on the arm: each planted fault is found by its own test, and only where it is."""
+"""A good policy that fails on the arm: each planted fault is found by its own test, and only where it is."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from fedvla_book import faults
+from fedvla_book.tables.faults import OWN, TESTS, found_faults, read_faults
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import diagnosis
 from fedvla_lib.policy import model
-from fedvla_lib.robot.tasks import PRETRAINING_TASKS
 
 CONFIG = from_profile("tiny", image_size=96, normalisation="base")
-TASK = PRETRAINING_TASKS["pull"]
+TASK = faults.PULL
 pytestmark = pytest.mark.integration
 
 
@@ -38,20 +38,22 @@ def frames(known):
 
 def test_each_fault_is_found_by_its_test_and_a_good_arm_raises_no_alarm(arms, known):
     found = faults.examine_all(arms, known, CONFIG, range(3_000_000, 3_000_004)).set_index("fault")
-    fired = {name: {test for test in faults.TESTS if row[test]} for name, row in found.iterrows()}
+    fired = {name: {test for test in TESTS if row[test]} for name, row in found.iterrows()}
     others = {"statistics missing": {"chunk"}}  # of numbers that mean nothing no shift fits
-    assert fired == {name: {test} - {""} | others.get(name, set()) for name, test in faults.OWN.items()}
+    assert fired == {name: {test} - {""} | others.get(name, set()) for name, test in OWN.items()}
     assert found.success_rate["none"] == 1.0
-    failing = set(faults.OWN) - {"none", "cameras exchanged"}  # this policy knows the table in either view
+    failing = set(OWN) - {"none", "cameras exchanged"}  # this policy knows the table in either view
     assert found.success_rate[list(failing)].max() <= 0.25
-    assert "finds 7 of 7 faults; others that fire: *chunk* (statistics missing)" in faults.sentence(found.reset_index())
+    assert "finds 7 of 7 faults. Tests that fire besides: *chunk* (statistics missing)." in found_faults(
+        found.reset_index()
+    )
 
 
 def test_a_chunk_offset_is_measured_in_steps(arms, frames):
     good = arms["none"].bundle
     assert diagnosis.lag_steps(good, frames) == 0
     for steps in (3, 6):
-        assert diagnosis.lag_steps(faults.skipping(good, steps), frames) == steps
+        assert diagnosis.lag_steps(faults.shifted(good, steps), frames) == steps
 
 
 def test_arrangements_done_twice_are_the_images_and_the_policy_sees_the_wrong_ones(arms, frames):
@@ -80,7 +82,7 @@ def test_a_moved_zero_is_reported_where_it_is(arms):
 
 
 def test_stored_faults_are_those_of_today():
-    stored = faults.read(Path(__file__).parents[1] / "book/reference/faults.json")
-    assert stored.fault.tolist() == list(faults.OWN) and stored.test.tolist() == list(faults.OWN.values())
+    stored = read_faults(Path(__file__).parents[1] / "book/reference/faults.json")
+    assert stored.fault.tolist() == list(OWN) and stored.test.tolist() == list(OWN.values())
     assert (stored.rollouts >= 40).all()
     assert (stored.low <= stored.success_rate).all() and (stored.success_rate <= stored.high).all()

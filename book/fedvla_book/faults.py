@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fedvla_book.sentences import rate
+from fedvla_book.tables.faults import OWN, TESTS
 from fedvla_lib.config import Config
 from fedvla_lib.data.episode_checks import Take, shift
 from fedvla_lib.data.frame_store import FrameStore
 from fedvla_lib.evaluation import diagnosis
 from fedvla_lib.evaluation.statistics import wilson
-from fedvla_lib.files import read_json
 from fedvla_lib.policy.actor import PolicyActor
 from fedvla_lib.policy.model import Bundle
 from fedvla_lib.robot.expert import Expert
@@ -27,14 +26,10 @@ from fedvla_lib.robot.layout import Region
 from fedvla_lib.robot.rollout import Episode, run_episodes
 from fedvla_lib.robot.sim import So100Env
 from fedvla_lib.robot.spec import CAMERAS, FPS
-from fedvla_lib.robot.tasks import Task
+from fedvla_lib.robot.stage import stage_of_process
+from fedvla_lib.robot.tasks import PRETRAINING_TASKS, Task
 
-OWN = {  # fault -> the test that belongs to it, in the order of the tree
-    "none": "", "statistics missing": "statistics", "cameras exchanged": "cameras", "cameras upside down": "cameras",
-    "half a chunk skipped": "chunk", "zero off by 10 degrees": "zero", "cube where none was": "table",
-    "another instruction": "instruction",
-}  # fmt: skip
-TESTS = ("statistics", "cameras", "chunk", "zero", "table", "instruction")  # in the order of the tree
+PULL = replace(PRETRAINING_TASKS["pull"], horizon_steps=50)  # twice as long as a demonstration takes
 BEYOND = 0.01  # statistics: share of joint values
 OTHERWISE = 0.9  # cameras: a loss below this share of the one as given
 LATE_STEPS = 2  # chunk: steps early or late
@@ -90,14 +85,17 @@ def seen(bundle: Bundle, arrangement: str) -> Bundle:
     return replace(bundle, preprocess=Changed(bundle.preprocess, before=wrong))
 
 
-def skipping(bundle: Bundle, steps: int) -> Bundle:
-    """Return the policy with the first steps of every chunk dropped, as if they were over when it arrives."""
+def shifted(bundle: Bundle, steps: int) -> Bundle:
+    """Return the policy whose chunks are played from so many steps after their first action, or before, if negative.
 
-    def later(chunk: Any) -> Any:
+    Before its first action and after its last a chunk stands still.
+    """
+
+    def played(chunk: Any) -> Any:
         last = chunk.shape[1] - 1
-        return chunk[:, [min(step + steps, last) for step in range(last + 1)]]
+        return chunk[:, [min(max(step + steps, 0), last) for step in range(last + 1)]]
 
-    return replace(bundle, postprocess=Changed(bundle.postprocess, after=later))
+    return replace(bundle, postprocess=Changed(bundle.postprocess, after=played))
 
 
 def zero_moved(arm: Arm, joint: int, degrees: float) -> Arm:
@@ -112,31 +110,23 @@ def elsewhere(task: Task, bearing_deg: tuple[float, float]) -> Task:
 
 
 def _environments(arm: Arm, config: Config, count: int, cameras: Sequence[str]) -> list[So100Env]:
-    """Return environments of an arm that share the renderer of the first."""
-    look = {"lab": arm.lab, "cameras": tuple(cameras)}
-    first = So100Env(arm.task, config.image_size, **look)
-    return [first, *(So100Env(arm.task, config.image_size, renderer_of=first, **look) for _ in range(1, count))]
+    envs = stage_of_process(config.image_size).envs(arm.task, count)
+    for env in envs:
+        env.lab, env.cameras = arm.lab, tuple(cameras)
+    return envs
 
 
 def roll_out(arm: Arm, config: Config, seeds: Sequence[int]) -> list[bool]:
     """Return which rollouts of the deployed policy succeed, one for each seed, in one batch."""
-    envs = _environments(arm, config, len(seeds), ())
-    try:
-        actors = [PolicyActor(arm.running, config.seed) for _ in seeds]
-        episodes = run_episodes(envs, actors, seeds, PolicyActor.act_together)
-    finally:
-        envs[0].close()
+    actors = [PolicyActor(arm.running, config.seed) for _ in seeds]
+    episodes = run_episodes(_environments(arm, config, len(seeds), ()), actors, seeds, PolicyActor.act_together)
     return [episode.success for episode in episodes]
 
 
 def by_hand(arm: Arm, config: Config, seeds: Sequence[int]) -> FrameStore:
     """Return demonstrations of the expert on this arm, as a data set of the policy would hold them."""
     envs = _environments(arm, config, len(seeds), CAMERAS)
-    try:
-        episodes = run_episodes(envs, [Expert() for _ in seeds], seeds)
-    finally:
-        envs[0].close()
-    return _as_store(episodes)
+    return _as_store(run_episodes(envs, [Expert() for _ in seeds], seeds))
 
 
 def _as_store(episodes: Sequence[Episode]) -> FrameStore:
@@ -170,7 +160,7 @@ def planted(good: Arm, config: Config, *, missing: Bundle, instruction: str) -> 
     """
     changed = (
         missing, seen(good.bundle, "exchanged"), seen(good.bundle, "upside down"),
-        skipping(good.bundle, config.n_action_steps),
+        shifted(good.bundle, -config.n_action_steps),
     )  # fmt: skip
     arms = [
         good, *(replace(good, bundle=bundle) for bundle in changed), zero_moved(good, 0, 10.0),
@@ -190,16 +180,21 @@ class Known:
 
 def examine_all(arms: Mapping[str, Arm], known: Known, config: Config, seeds: Sequence[int]) -> pd.DataFrame:
     """Return a row for each arm: fault, test (its own), `examine`."""
+    today: dict[Any, FrameStore] = {}  # people demonstrate once on the same arm and table
+    for arm in arms.values():
+        if (place := (arm.lab, arm.task)) not in today:
+            today[place] = by_hand(arm, config, range(TODAY, TODAY + HANDS))
     return pd.DataFrame(
-        {"fault": name, "test": OWN[name]} | examine(arm, known, config, seeds) for name, arm in arms.items()
+        {"fault": name, "test": OWN[name]} | examine(arm, known, today[arm.lab, arm.task], config, seeds)
+        for name, arm in arms.items()
     )
 
 
-def examine(arm: Arm, known: Known, config: Config, seeds: Sequence[int]) -> dict[str, Any]:
+def examine(arm: Arm, known: Known, today: FrameStore, config: Config, seeds: Sequence[int]) -> dict[str, Any]:
     """Return the success of an arm on fresh layouts with its interval, and whether each of `TESTS` fires, and why."""
-    fresh, again = roll_out(arm, config, seeds), roll_out(replace(arm, task=known.task), config, known.seeds)
+    fresh, again = _on_fresh_and_recorded(arm, known, config, seeds)
     low, high = wilson(sum(fresh), len(fresh))
-    values = by_demonstrations(arm, known, config) | {"table": float(np.mean(again) - np.mean(fresh))}
+    values = by_demonstrations(arm, known, today, config) | {"table": float(np.mean(again) - np.mean(fresh))}
     fires = {
         "statistics": values["statistics"] > BEYOND, "cameras": values["cameras"] < OTHERWISE,
         "chunk": abs(values["chunk"]) >= LATE_STEPS, "zero": values["zero"] > 0, "table": values["table"] >= WORSE,
@@ -209,9 +204,18 @@ def examine(arm: Arm, known: Known, config: Config, seeds: Sequence[int]) -> dic
     return share | fires | {f"{test} value": values[test] for test in TESTS}
 
 
-def by_demonstrations(arm: Arm, known: Known, config: Config) -> dict[str, float]:
+def _on_fresh_and_recorded(
+    arm: Arm, known: Known, config: Config, seeds: Sequence[int]
+) -> tuple[list[bool], list[bool]]:
+    """Return which rollouts succeed on fresh layouts and on the recorded ones; in one batch if they are of one kind."""
+    if arm.task != known.task:
+        return roll_out(arm, config, seeds), roll_out(replace(arm, task=known.task), config, known.seeds)
+    both = roll_out(arm, config, [*seeds, *known.seeds])
+    return both[: len(seeds)], both[len(seeds) :]
+
+
+def by_demonstrations(arm: Arm, known: Known, today: FrameStore, config: Config) -> dict[str, float]:
     """Return the numbers that the recordings and today's demonstrations give, by test."""
-    today = by_hand(arm, config, range(TODAY, TODAY + HANDS))
     frames, running = diagnosis.frames_of(today, config), arm.running
     losses = diagnosis.loss_by_arrangement(running, frames)
     return {
@@ -220,22 +224,3 @@ def by_demonstrations(arm: Arm, known: Known, config: Config) -> dict[str, float
         "zero": len(shift(takes(today), takes(known.store))),
         "instruction": losses["as given"] / diagnosis.loss(arm.bundle, frames),
     }  # fmt: skip
-
-
-def read(file: Path) -> pd.DataFrame:
-    """Return the stored table of `book/tools/fault_study.py`."""
-    return pd.DataFrame(read_json(file)["rows"])
-
-
-def sentence(found: pd.DataFrame) -> str:
-    """Return in words what tests found in a table of `examine_all`."""
-    rates = found.set_index("fault")
-    own = [row.fault for row in found.itertuples() if row.test and getattr(row, row.test)]
-    besides = [
-        f"*{test}* ({row['fault']})" for _, row in found.iterrows() for test in TESTS if row[test] and test != row.test
-    ]
-    parts = [f"{name} {rate(row)}" for name, row in rates.iterrows()]
-    return (
-        f"Success: {'; '.join(parts)}. The test of its own finds {len(own)} of {len(found) - 1} faults; others that "
-        f"fire: {', '.join(besides) or 'none'}."
-    )

@@ -12,8 +12,9 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from unittest import mock
+from unittest.mock import patch
 
+import av
 import pandas as pd
 
 # Importing them is what makes LeRobot know the simulated arm and the script, as its plugins do.
@@ -40,23 +41,25 @@ class Clock:
         self.now_s += seconds
 
 
-def run(command: str, flags: Mapping[str, object]) -> list[str]:
-    """Run a command such as ``lerobot-record``, and return what the simulated arm and the script logged.
+def run(command: str, flags: Mapping[str, object] | Sequence[str]) -> list[str]:
+    """Run a command such as ``lerobot-record``, and return what the simulated arm logged, and the warnings of all.
 
     Args:
-        flags: with their values, without dashes, such as ``{"robot.type": "so100_sim"}``.
+        flags: as `arguments` takes them, or as a command line has them.
     """
+    line = arguments(flags) if isinstance(flags, Mapping) else flags
     module = importlib.import_module(f"lerobot.scripts.{command.replace('-', '_')}")
     with contextlib.ExitStack() as changed, _listening() as lines:
         clock = Clock()
         for loop in (module, *(importlib.import_module(f"lerobot.{name}") for name in LOOPS)):
             if hasattr(loop, "precise_sleep"):
-                changed.enter_context(mock.patch.object(loop, "time", clock))
-                changed.enter_context(mock.patch.object(loop, "precise_sleep", clock.precise_sleep))
+                changed.enter_context(patch.object(loop, "time", clock))
+                changed.enter_context(patch.object(loop, "precise_sleep", clock.precise_sleep))
         for name in TIMED:
-            changed.enter_context(mock.patch.object(importlib.import_module(name), "time", clock))
-        changed.enter_context(mock.patch.object(module, "init_logging"))  # it would write to the page
-        changed.enter_context(mock.patch.object(sys, "argv", [command, *arguments(flags)]))
+            changed.enter_context(patch.object(importlib.import_module(name), "time", clock))
+        if hasattr(module, "init_logging"):  # it would write to the page
+            changed.enter_context(patch.object(module, "init_logging"))
+        changed.enter_context(patch.object(sys, "argv", [command, *line]))
         changed.enter_context(contextlib.redirect_stdout(io.StringIO()))
         changed.enter_context(contextlib.redirect_stderr(io.StringIO()))
         for sign in SIGNALS:
@@ -67,22 +70,23 @@ def run(command: str, flags: Mapping[str, object]) -> list[str]:
 
 @contextlib.contextmanager
 def _listening() -> Iterator[list[str]]:
+    """Collect log lines in place of the handlers that would write them to the page."""
     lines: list[str] = []
-    handler, logger = logging.Handler(), logging.getLogger(ARM)
+    handler, root, arm = logging.Handler(), logging.getLogger(), logging.getLogger(ARM)
     handler.emit = lambda record: lines.append(record.getMessage())
-    before = logger.level, logger.propagate
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    logger.propagate = False
+    before = root.handlers, root.level, arm.level
+    root.handlers = [handler]
+    root.setLevel(logging.WARNING)
+    arm.setLevel(logging.INFO)
+    av.logging.set_libav_level(av.logging.ERROR)  # its encoders write to the terminal without Python
     try:
         yield lines
     finally:
-        logger.removeHandler(handler)
-        logger.level, logger.propagate = before
+        root.handlers, root.level, arm.level = before
 
 
 def arguments(flags: Mapping[str, object]) -> list[str]:
-    """Return flags as a command line has them."""
+    """Return flags, given without dashes such as ``{"robot.type": "so100_sim"}``, as a command line has them."""
     return [f"--{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in flags.items()]
 
 
@@ -95,7 +99,7 @@ def cameras(names: Sequence[str], fps: int, width: int = 640, height: int = 480)
 
 def side_by_side(**commands: Mapping[str, object]) -> pd.DataFrame:
     """Return two command lines as a table, a row for each flag, with those marked that differ."""
-    names = list(dict.fromkeys(name for flags in commands.values() for name in flags))
+    names = sorted({name for flags in commands.values() for name in flags})
     table = pd.DataFrame(
         {who: [shlex.quote(arguments({"": flags[name]})[0][3:]) if name in flags else "" for name in names]
          for who, flags in commands.items()},

@@ -14,20 +14,19 @@ from fedvla_lib import files, provenance
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation
 from fedvla_lib.policy import model
-from fedvla_lib.robot.tasks import PRETRAINING_TASKS
 
 RECORDED = 8  # demonstrations that stand for the recordings
 FRESH = 3_000_000  # first seed of the rollouts
 OTHER = "Reach for the red cube."
 
 
-def study(rollouts: int, task_name: str = "pull") -> dict[str, object]:
+def study(rollouts: int) -> dict[str, object]:
     """Return a stamp and the rows of `faults.examine_all`."""
-    config = from_profile("laptop", tasks=task_name, normalisation="base", num_threads=1)
-    task, stamp = PRETRAINING_TASKS[task_name], provenance.first_stamp(config, "faults")
+    config = from_profile("laptop", tasks="pull", normalisation="base", num_threads=1)
+    stamp = provenance.first_stamp(config, "faults")
     nothing = normalisation.common_statistics(replace(config, normalisation="none"), {})
-    good = faults.Arm(model.load_policy(config), task)
-    known = faults.Known(faults.by_hand(good, config, range(RECORDED)), range(RECORDED), task)
+    good = faults.Arm(model.load_policy(config), faults.PULL)
+    known = faults.Known(faults.by_hand(good, config, range(RECORDED)), range(RECORDED), faults.PULL)
     arms = faults.planted(good, config, missing=model.load_policy(config, nothing), instruction=OTHER)
     found = faults.examine_all(arms, known, config, range(FRESH, FRESH + rollouts))
     return stamp | {"status": "completed", "rows": found.to_dict("records")}

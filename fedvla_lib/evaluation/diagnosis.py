@@ -15,7 +15,7 @@ import torch
 from fedvla_lib.config import Config
 from fedvla_lib.data.batches import batch_of_rows, frame_rows
 from fedvla_lib.data.frame_store import FrameStore
-from fedvla_lib.evaluation.held_out import VALIDATION_STRIDE, average, measure_frames
+from fedvla_lib.evaluation.held_out import VALIDATION_STRIDE
 from fedvla_lib.policy import prefix_cache
 from fedvla_lib.policy.actor import starting_noise
 from fedvla_lib.policy.model import Bundle
@@ -55,9 +55,15 @@ def beyond_statistics(bundle: Bundle, store: FrameStore) -> float:
     return float(np.mean(shares))
 
 
+@torch.no_grad()
 def loss(bundle: Bundle, frames: Frames, seed: int = 0, **changed: Any) -> float:
-    """Return the flow-matching loss on the frames, with entries of the batch `changed`; noise fixed by `seed`."""
-    return average(measure_frames(bundle, [frames.batch | changed], tolerance=1.0, seed=seed))["loss"]
+    """Return the flow-matching loss on the frames, with entries of the batch `changed`; `seed` fixes noise and time."""
+    generator, size = torch.Generator().manual_seed(seed), len(frames.rows)
+    noise = starting_noise(bundle, size, generator)
+    times = (torch.randperm(size, generator=generator) + 0.5) / size
+    batch = frames.batch | changed
+    prefixed = batch | {prefix_cache.PREFIX_KEY: prefix_cache.prefill(bundle, batch)}
+    return prefix_cache.prefix_loss(bundle, prefixed, noise, times.to(noise.device)).item()
 
 
 def arrangements(batch: dict[str, Any]) -> dict[str, dict[str, Any]]:
