@@ -41,7 +41,8 @@ FENCES = {
     "torch": {
         "policy.actor", "policy.gradient_checkpoints", "policy.lean_expert", "policy.lora", "policy.model",
         "policy.optimizers", "policy.parameters", "policy.prefix_cache", "policy.training",
-        "data.augmentation", "data.batches", "data.frame_store", "evaluation.held_out", "pretraining.grounding",
+        "data.augmentation", "data.batches", "data.frame_store", "evaluation.diagnosis", "evaluation.held_out",
+        "pretraining.grounding",
         f"{STRATEGIES}.fedprox", f"{STRATEGIES}.scaffold",
     },
     "lerobot": {

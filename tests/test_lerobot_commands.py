@@ -3,14 +3,12 @@
 Their clock is simulated, so that an episode has as many frames on a busy machine as on an idle one.
 """
 
-import importlib
 import importlib.metadata
 import json
 import logging
 import os
 import re
 import shlex
-import signal
 import socket
 import sys
 import threading
@@ -29,6 +27,7 @@ from lerobot.robots.so_follower import so_follower as so_follower_module
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from fedvla_book import lerobot_commands
 from fedvla_lib.config import from_profile
 from fedvla_lib.policy import model
 from fedvla_lib.policy.portable import export
@@ -75,40 +74,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     os.chdir(before)
 
 
-class Clock:
-    """Counts seconds; only waiting takes time."""
-
-    now_s = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now_s
-
-    def precise_sleep(self, seconds: float) -> None:
-        self.now_s += seconds
-
-
 def lerobot(module: str, *arguments: object) -> None:
     """Run a command of LeRobot on a simulated clock."""
-    with pytest.MonkeyPatch.context() as patch:
-        command, clock = importlib.import_module(f"lerobot.{module}"), Clock()
-        loops = [
-            importlib.import_module(f"lerobot.{name}")
-            for name in ("rollout.strategies.base", "rollout.strategies.core")
-        ]
-        for loop in (command, *loops):
-            if hasattr(loop, "precise_sleep"):
-                patch.setattr(loop, "time", clock)
-                patch.setattr(loop, "precise_sleep", clock.precise_sleep)
-        patch.setattr("fedvla_lib.robot.lerobot_teleoperator.time", clock)
-        patch.setattr(sys, "argv", [module, *map(str, arguments)])
-        handlers = {
-            sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-        }
-        try:
-            command.main()
-        finally:  # lerobot-rollout leaves its own
-            for sign, handler in handlers.items():
-                signal.signal(sign, handler)
+    lerobot_commands.run(module.removeprefix("scripts.").replace("_", "-"), list(map(str, arguments)))
 
 
 ROBOT = (
@@ -169,6 +137,16 @@ def test_the_distributions_are_found_by_name(place):
     assert names >= PLUGINS
     register_third_party_plugins()
     assert set(sys.modules) >= PLUGINS
+
+
+def test_flags_become_a_command_line_and_two_of_them_a_table_that_marks_what_differs():
+    views = lerobot_commands.cameras(["top", "wrist"], fps=30)
+    one = {"robot.type": "so100_sim", "robot.cameras": views, "play_sounds": False}
+    assert lerobot_commands.arguments(one)[::2] == ["--robot.type=so100_sim", "--play_sounds=false"]
+    assert "wrist: {type: opencv, index_or_path: 1, width: 640, height: 480, fps: 30}}" in views
+    table = lerobot_commands.side_by_side(simulated=one, real=one | {"robot.type": "so101_follower", "robot.port": "p"})
+    assert table.index[table.differs != ""].tolist() == ["--robot.port", "--robot.type"]
+    assert table.simulated["--robot.port"] == "" and table.real["--robot.type"] == "so101_follower"
 
 
 def test_record_holds_what_the_arm_did_with_frames_of_its_rate(recorded):

@@ -326,6 +326,19 @@ def test_success_by_demonstrations_draws_a_line_per_method_over_a_log_axis():
     assert [label.get_text() for label in ax.get_xticklabels()] == ["1", "2", "4"]
 
 
+def test_a_fault_map_has_a_mark_for_each_test_that_fires_and_for_an_own_one_that_does_not():
+    found = pd.DataFrame({
+        "fault": ["none", "zero", "cable"], "test": ["", "calibration", "cameras"], "success_rate": [0.9, 0.1, 0.0],
+        "low": [0.7, 0.0, 0.0], "high": [1.0, 0.3, 0.2], "calibration": [False, True, True],
+        "cameras": [False, False, False],
+    })  # fmt: skip
+    bars, grid = plots.fault_map(found, ["calibration", "cameras"])
+    assert bars.get_xlabel() == "success rate" and [bar.get_width() for bar in bars.patches] == [0.9, 0.1, 0.0]
+    own, another, silent = (marks.get_offsets().data.tolist() for marks in grid.collections)
+    assert (own, another, silent) == ([[0, 1]], [[0, 2]], [[1, 2]])
+    assert [label.get_text() for label in bars.get_yticklabels()] == ["none", "zero", "cable"]
+
+
 def checkpoint_table():
     return pd.DataFrame(
         {"method": ["a", "a", "a", "a", "b", "b", "b"], "run": [0, 0, 1, 1, 0, 0, 0], "steps": [0, 8, 0, 8, 0, 4, 8],

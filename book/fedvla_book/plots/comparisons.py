@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from fedvla_book.plots.style import DASHES, client_color, method_color, to_ends
+from fedvla_book.plots.style import DASHES, client_color, legend_above, method_color, to_ends
 from fedvla_lib.evaluation.figures import PALETTE, WIDTH, new_axes
 
 
@@ -176,4 +176,33 @@ def heat_maps(
         ax.set_xlabel(xlabel)
     axes[0].set_ylabel(ylabel)
     axes[0].figure.colorbar(image, ax=list(axes), label=label)
+    return axes
+
+
+def fault_map(found: pd.DataFrame, tests: Sequence[str], *, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Draw the success under each fault with its interval, and beside it which tests fire.
+
+    Args:
+        found: a row per fault, from the top: fault, success_rate, low, high, ``test``, which is the test that belongs
+            to the fault ("" for none), and a column of true and false for each of `tests`.
+    """
+    if axes is None:
+        shape = {"figsize": (WIDTH, 0.36 * len(found) + 1.1), "width_ratios": (2, 3)}
+        _, axes = plt.subplots(1, 2, sharey=True, layout="constrained", **shape)
+    bars, grid = axes
+    rows = np.arange(len(found))
+    bars.barh(rows, found.success_rate, color=PALETTE[0], height=0.6)
+    bars.errorbar(found.success_rate, rows, xerr=to_ends(found), fmt="none", color="black", capsize=3)
+    bars.set(xlim=(0, 1), xlabel="success rate", ylabel="fault", yticks=rows, yticklabels=found.fault)
+    fires = found[list(tests)].to_numpy(bool)
+    own = np.array([[test == of for test in tests] for of in found.test])
+    for which, color, label in (
+        (fires & own, PALETTE[2], "its own test fires"), (fires & ~own, PALETTE[4], "another fires"),
+        (~fires & own, PALETTE[1], "its own does not"),
+    ):  # fmt: skip
+        y, x = np.nonzero(which)
+        grid.scatter(x, y, marker="s", s=130, color=color, label=label)
+    grid.set(xlim=(-0.6, len(tests) - 0.4), ylim=(len(found) - 0.5, -0.5), xlabel="test")
+    grid.set_xticks(range(len(tests)), tests, rotation=30, ha="right")
+    legend_above([grid])
     return axes
