@@ -141,8 +141,8 @@ def test_methods_are_named_by_their_steps_and_those_alone_split_by_whose_task_it
 
 def test_a_folder_without_federated_cells_is_named(tmp_path):
     known = {"method": "pooled", "kind": "centralized", "partition": "task", "seed": 0, "gradient_steps": 1,
-             "samples": 1,
-             "bytes": 0, "train_s": None}  # fmt: skip
+             "samples": 1, "bytes": 0, "train_s": None, "status": "completed", "engine": "inline", "started": "",
+             "wall_s": None}  # fmt: skip
     (tmp_path / "task_pooled_0").mkdir()
     (tmp_path / "task_pooled_0" / "stamp.json").write_text(json.dumps(known))
     with pytest.raises(ValueError, match="no federated cell") as caught:

@@ -106,7 +106,7 @@ def test_a_script_that_workers_would_start_again_is_told_so_and_ends(tmp_path):
     (tmp_path / "unguarded.py").write_text(UNGUARDED)
     command = [sys.executable, tmp_path / "unguarded.py", tmp_path / "recording"]
     environment = {**os.environ, "FEDVLA_JOBS": "2"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1 and "put its calls below if __name__ == '__main__':" in done.stderr
 
 

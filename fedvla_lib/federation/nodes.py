@@ -148,9 +148,13 @@ def introduce_nodes(grid: Grid, nodes: list[int], report: Report, timeout_s: flo
 
 
 def plain(text: str) -> str:
-    """Return what a client said as one short line without control characters, for terminals and logs."""
-    words = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * LONGEST]).split())
-    return words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."
+    """Return what a client said as one short line without control characters, for terminals and logs.
+
+    Of a long text its beginning and its end are kept: a traceback names the error last.
+    """
+    text = text if len(text) <= 4 * LONGEST else text[:LONGEST] + text[-LONGEST:]
+    words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return words if len(words) <= LONGEST else f"{words[: LONGEST // 4]} ... {words[5 - 3 * LONGEST // 4 :]}"
 
 
 def answered(reply: Message | None, most_bytes: float) -> Message:
