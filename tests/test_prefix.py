@@ -9,6 +9,7 @@ import torch
 from fedvla_lib.config import from_profile
 from fedvla_lib.data import normalisation
 from fedvla_lib.data.batches import Batches
+from fedvla_lib.data.frame_store import open_store
 from fedvla_lib.evaluation import held_out
 from fedvla_lib.policy import model, prefix_cache, training
 from fedvla_lib.policy.actor import starting_noise
@@ -86,6 +87,17 @@ def test_another_model_or_normalisation_gets_prefixes_of_its_own(store, tmp_path
     prefix_cache.ensure_prefixes(model.load_policy(CONFIG, stats), store, folder=tmp_path)
     prefix_cache.ensure_prefixes(fresh(store, replace(CONFIG, lora_rank=2)), store, folder=tmp_path)  # as the first
     assert len(folders()) == 3
+
+
+@pytest.mark.unit
+def test_other_cameras_of_the_same_data_get_prefixes_of_their_own(recording, store, tmp_path):
+    one, other = CAMERAS
+    names = {one: (other,), other: (one,)}
+    exchanged = open_store(recording, image_size=CONFIG.image_size, cameras=names, progress=False)
+    np.testing.assert_array_equal(exchanged.states, store.states)
+    bundle = fresh(store)
+    found = [prefix_cache.ensure_prefixes(bundle, each, folder=tmp_path).cache for each in (store, exchanged)]
+    assert not np.array_equal(*found)
 
 
 @pytest.mark.unit

@@ -349,6 +349,18 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: os.truncate(root / "meta/info.json", 100),
         r"meta/info\.json is not JSON",
     ),
+    "a list for a description": (
+        lambda root: (root / "meta/info.json").write_text("[]"),
+        r"meta/info\.json says format None",
+    ),
+    "no features": (
+        lambda root: edit_info(root, lambda info: info.pop("features")),
+        r"meta/info\.json is damaged: features: Field required",
+    ),
+    "text for the rate": (
+        lambda root: edit_info(root, lambda info: info.update(fps="ten")),
+        r"meta/info\.json is damaged: fps: Input should be a valid number",
+    ),
     "no episodes": (
         lambda root: edit_info(root, lambda info: info.update(total_episodes=0)),
         "has no complete episode",

@@ -11,7 +11,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from fedvla_lib.data.lerobot_reader import OLD_FORMAT, DataError, locate
-from fedvla_lib.files import cache_dir, new_folder
+from fedvla_lib.files import cache_dir, new_folder, read_json
 
 PARTS = ("meta", "data", "videos")  # folders of a data set
 COMMAND = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/data --root=COPY --push-to-hub=false"
@@ -43,7 +43,7 @@ def fingerprint(root: Path, *settings: object) -> str:
 
 def _is_old(root: Path) -> bool:
     try:
-        return json.loads((root / "meta/info.json").read_text()).get("codebase_version") == OLD_FORMAT
+        return read_json(root / "meta/info.json").get("codebase_version") == OLD_FORMAT
     except (OSError, ValueError):  # the reader says what is wrong
         return False
 

@@ -37,6 +37,7 @@ class FrameStore:
     actions: np.ndarray  # float32 (N, 6): joint targets, LeRobot units
     images: dict[str, np.ndarray]  # camera -> uint8 (N, size, size, 3), memory-mapped, read-only
     episodes: pd.DataFrame  # episode_id, start, end (rows, end excluded), num_frames, instruction, task, lab
+    key: str = ""  # hash of the data set's files and of how they were decoded; "" for frames that were never files
 
     @property
     def num_frames(self) -> int:
@@ -120,7 +121,7 @@ def _load(root: Path, folder: Path) -> FrameStore:
     return FrameStore(
         root=root, fps=content["fps"], states=np.load(folder / "states.npy"), actions=np.load(folder / "actions.npy"),
         images={camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in content["cameras"]},
-        episodes=pd.DataFrame(json.loads((folder / "episodes.json").read_text())),
+        episodes=pd.DataFrame(json.loads((folder / "episodes.json").read_text())), key=folder.name,
     )  # fmt: skip
 
 

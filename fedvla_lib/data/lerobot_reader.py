@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import av
 import numpy as np
@@ -24,6 +24,7 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from PIL import Image
 
+from fedvla_lib.files import checked
 from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, IMAGE_PREFIX, JOINT_NAMES, LAB_KEY, NUM_JOINTS, STATE_KEY
 from fedvla_lib.robot.tasks import task_of
 
@@ -115,6 +116,20 @@ def read_dataset(root: Path, cameras: Cameras | None) -> ReadDataset:
     return ReadDataset(outline, episodes, states, actions)
 
 
+class Feature(TypedDict):
+    """What is read of a feature's description."""
+
+    dtype: str
+
+
+class Info(TypedDict):
+    """What has to be in ``meta/info.json``."""
+
+    features: dict[str, Feature]
+    fps: float
+    data_path: str
+
+
 def read_info(root: Path) -> dict[str, Any]:
     """Return the description of a data set; raise DataError if it has none, or is in another format."""
     path = root / "meta/info.json"
@@ -122,14 +137,18 @@ def read_info(root: Path) -> dict[str, Any]:
         info = json.loads(path.read_text())
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {root} is not a LeRobotDataset, or its recording never started") from None
-    except json.JSONDecodeError as error:
+    except ValueError as error:
         raise DataError(f"{path} is not JSON: {error}") from error
-    if info.get("codebase_version") != FORMAT:
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if version != FORMAT:
         raise DataError(
-            f"{path} says format {info.get('codebase_version')}, this reads {FORMAT} and {OLD_FORMAT}: convert it to "
+            f"{path} says format {version}, this reads {FORMAT} and {OLD_FORMAT}: convert it to "
             f"{OLD_FORMAT} with LeRobot 0.3"
         )
-    return info
+    try:
+        return checked(info, Info, str(path))
+    except ValueError as error:
+        raise DataError(str(error)) from error
 
 
 def _check_features(root: Path, info: dict[str, Any]) -> None:

@@ -157,12 +157,12 @@ def _pad(tokens: torch.Tensor, length: int) -> torch.Tensor:
 
 
 def _fingerprint(bundle: Bundle, store: FrameStore, rows: np.ndarray) -> str:
-    """Hash of everything that prefixes depend on: weights before the expert, statistics, the data set and its rows."""
+    """Hash of all that prefixes depend on: weights before the expert, statistics, the data set as decoded, its rows."""
     weights = {n: p.detach().contiguous().cpu() for n, p in bundle.policy.named_parameters() if n.startswith(BEFORE)}
     digest = hashlib.sha256(save(weights))
     for step in bundle.preprocess.steps:
         for name, value in sorted(step.state_dict().items()):
             digest.update(name.encode() + value.cpu().numpy().tobytes())
-    digest.update(f"{store.root}|{len(store.states)}".encode() + store.states.tobytes() + rows.tobytes())
+    digest.update(f"{store.root}|{store.key}|{len(store.states)}".encode() + store.states.tobytes() + rows.tobytes())
     digest.update("|".join(store.episodes.instruction).encode())
     return digest.hexdigest()[:16]
