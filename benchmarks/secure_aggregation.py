@@ -79,7 +79,7 @@ def sending(update: np.ndarray, config: Config) -> ClientApp:
         else:
             metrics["loss"] = 0.0
         content = {messages.ARRAYS: messages.pack_arrays(arrays), messages.METRICS: MetricRecord(metrics)}
-        note = messages.make_note(sha256=digest(arrays))
+        note = messages.make_note(sha256=digest(arrays), **messages.round_of(message.content))
         return Message(RecordDict(content | {messages.NOTE: note}), reply_to=message)
 
     for name, handler in secure_round.HANDLERS.items():
