@@ -38,6 +38,7 @@ class Config:
     fraction_evaluate: float = 1.0  # fraction of clients that evaluate in each round
     min_replies: int = 1  # valid training replies needed in each round; with fewer the run stops
     frames_cap: float = 10.0  # a client counts for at most this many times the median number of frames; 0: no limit
+    update_cap: float = 3.0  # an update longer than this many times the median of its round is shortened; 0: no limit
     reply_limit_mb: float = 0.0  # largest reply of a client, in MB; 0: 100, and twice the arrays
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # one of `STRATEGIES`, for example fedavg, or module:Class of a Flower strategy of yours
@@ -123,7 +124,7 @@ POSITIVE = {
 }  # fmt: skip
 MOST = {  # more is a slip of the keyboard, or takes more memory than there is
     "episodes_per_task": 1e6, "image_size": 4096, "fps": 1000, "num_labs": 1000, "num_clients": 1e5,
-    "num_server_rounds": 1e6, "min_replies": 1e5, "frames_cap": 1e9, "reply_limit_mb": 1e9,
+    "num_server_rounds": 1e6, "min_replies": 1e5, "frames_cap": 1e9, "update_cap": 1e9, "reply_limit_mb": 1e9,
     "round_timeout_s": 1e9, "server_lr": 1e6, "clip_norm": 1e9, "noise": 1e6,
     "epsilon_budget": 1e6, "num_malicious": 1e5, "proximal_mu": 1e6, "dirichlet_alpha": 1e6, "chunk_size": 10_000,
     "n_action_steps": 10_000, "lora_rank": 4096, "local_steps": 1e7, "batch_size": 65_536, "alone_steps": 1e9,

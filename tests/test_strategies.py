@@ -274,7 +274,7 @@ def flat(arrays):
 
 
 @pytest.mark.parametrize("factor", [-20.0, -1.0, 50.0], ids=["scaled and turned", "turned", "scaled"])
-def test_one_poisoned_client_of_ten_breaks_fedavg_and_not_the_robust_strategies(factor):
+def test_one_poisoned_client_of_ten_breaks_an_average_without_limits_and_not_the_robust_strategies(factor):
     """Honest clients send similar updates; the tenth sends its update times a factor, with a valid hash."""
     start, wanted = random_arrays(99), random_arrays(98)
 
@@ -284,14 +284,14 @@ def test_one_poisoned_client_of_ten_breaks_fedavg_and_not_the_robust_strategies(
         return reply_content({name: start[name] + np.float32(times) * (wanted[name] + noise[name]) for name in SHAPES})
 
     servers = {
-        "fedavg": {}, "fedmedian": {"strategy": "fedmedian"}, "krum": {"strategy": "krum"},
-        "clipped": {"clip_norm": float(np.linalg.norm(flat(wanted)))},
+        "fedavg": {"update_cap": 0.0}, "capped": {}, "fedmedian": {"strategy": "fedmedian"},
+        "krum": {"strategy": "krum"}, "clipped": {"clip_norm": float(np.linalg.norm(flat(wanted)))},
     }  # fmt: skip
     off = {}
     for name, settings in servers.items():
         arrays, _, _ = one_round(answering(moved), 10, start=start, **settings)
         off[name] = np.linalg.norm(flat(arrays) - flat(start) - flat(wanted)) / np.linalg.norm(flat(wanted))
-    assert off["fedmedian"] < 0.2 and off["krum"] < 0.5 and off["clipped"] < 0.35
+    assert off["fedmedian"] < 0.2 and off["krum"] < 0.5 and off["clipped"] < 0.35 and off["capped"] < 0.45
     assert off["fedavg"] > (2 * off["fedmedian"] if factor == -1.0 else 1.5)
 
 
@@ -318,6 +318,37 @@ def test_the_cap_on_frames_does_not_bind_clients_that_differ_as_labs_do():
     assert [roster.weight(k) for k in range(4)] == [20, 100, 140, 900]
 
 
+@pytest.mark.parametrize("cap", [0.0, 3.0], ids=["no limit", "three times the median"])
+def test_an_update_much_longer_than_the_others_is_shortened_and_reported(cap):
+    start = random_arrays(99)
+    changes = [random_arrays(k, scale=1e6 if k == 2 else 1.0) for k in range(5)]
+    app = answering(lambda k, _: reply_content({name: start[name] + changes[k][name] for name in SHAPES}))
+    averaged, _, events = one_round(app, 5, start=start, update_cap=cap)
+    lengths = [np.sqrt(sum(np.square(array).sum() for array in change.values())) for change in changes]
+    factor = np.ones(5)
+    if cap:
+        factor[2] = cap * np.median(lengths) / lengths[2]
+    for name in SHAPES:
+        wanted = start[name] + np.mean([rate * change[name] for rate, change in zip(factor, changes, strict=True)], 0)
+        np.testing.assert_allclose(averaged[name], wanted, rtol=1e-4, atol=1e-4)
+    capped = [(who, values["record"]) for _, who, kind, values in events if kind == "capped"]
+    assert capped == ([("client_2", ARRAYS)] if cap else [])
+
+
+def test_the_cap_on_updates_changes_no_bit_where_lengths_differ_as_labs_do():
+    app = answering(lambda k, start: reply_content({n: start[n] + random_arrays(k, 1.2**k)[n] for n in SHAPES}))
+    one, other = (one_round(app, 4, update_cap=cap)[0] for cap in (0.0, Config().update_cap))
+    assert all((one[name] == other[name]).all() for name in SHAPES)
+
+
+def test_under_noise_no_length_depends_on_the_other_clients():
+    """Else one client more or less would move the others' updates, beyond what the noise covers."""
+    app = answering(lambda k, start: reply_content({n: start[n] + random_arrays(k, 50.0**k)[n] for n in SHAPES}))
+    settings = {"clip_norm": 1e6, "noise": 1e-9, "normalisation": "base"}
+    one, other = (one_round(app, 4, update_cap=cap, **settings)[0] for cap in (0.0, 1.0))
+    assert all((one[name] == other[name]).all() for name in SHAPES)
+
+
 def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
     """A client that announces a billion frames from the start and sends an update in the opposite direction."""
     start, wanted = random_arrays(99), random_arrays(98)
@@ -331,7 +362,7 @@ def test_frames_are_taken_on_trust_and_only_some_strategies_do_without_them():
     length, limit = float(np.linalg.norm(flat(wanted))), 0.5
 
     def mean_update(**settings):
-        arrays, _, events = one_round(answering(moved), 10, start=start, **settings)
+        arrays, _, events = one_round(answering(moved), 10, start=start, update_cap=0.0, **settings)
         assert not events.rejected()
         return (flat(arrays) - flat(start)) / length, flat(wanted) / length
 

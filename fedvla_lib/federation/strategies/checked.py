@@ -28,6 +28,7 @@ from fedvla_lib.federation.drift import geometry
 from fedvla_lib.federation.nodes import Report, Roster, TooFewReplies, answered, plain
 from fedvla_lib.federation.quantisation import DOWNWARD, encode
 from fedvla_lib.federation.rollout_replies import Rollouts, unpack_rollouts
+from fedvla_lib.federation.strategies.reply_checks import check_metrics, examples, require_finite
 from fedvla_lib.policy.optimizers import SHARING
 from fedvla_lib.policy.parameters import Arrays, ParameterError, Shapes, digest
 from fedvla_lib.policy.training import seeded
@@ -118,6 +119,8 @@ class Checked:
         for reply in valid:
             self._restore(reply)
         self._report_drift(server_round, valid)
+        if self.config.update_cap and not privacy.weighs_alike(self.config):  # else a length would depend on others
+            self._cap(server_round, valid)
         if self.config.clip_norm or self.ledger:
             self._protect(server_round, valid)
         self._before_aggregation(valid)
@@ -131,7 +134,7 @@ class Checked:
             raise TooFewReplies(f"round {server_round}: strategy={self.config.strategy} refused {len(valid)} replies")
         # Flower's adaptive strategies compute in float64.
         model = {name: np.asarray(array.numpy(), np.float32) for name, array in arrays.items()}
-        _require_finite(server_round, {messages.ARRAYS: model, **self.state()})
+        require_finite(server_round, {messages.ARRAYS: model, **self.state()})
         return ArrayRecord({name: Array(array) for name, array in model.items()}), metrics
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
@@ -141,7 +144,7 @@ class Checked:
         valid = self._valid(server_round, "evaluate", replies, partial(self._check_evaluate, most=due))
         for node in [reply.metadata.src_node_id for reply in valid]:
             self.keep_rollouts(server_round, self.roster.name(node), self._rolled_out.pop(node))
-        measured = [reply for reply in valid if _examples(reply) > 0]
+        measured = [reply for reply in valid if examples(reply) > 0]
         return super().aggregate_evaluate(server_round, measured) if measured else None
 
     @property
@@ -230,17 +233,30 @@ class Checked:
                 self._replace(reply, payload)
         self.report(server_round, GLOBAL, "privacy", values)
 
-    def _payload(self, reply: Message) -> privacy.Payload:
+    def _cap(self, server_round: int, valid: list[Message]) -> None:
+        """Shorten what is longer than `update_cap` times the round's median: of the weights' change, of each record."""
+        for record in self.records:
+            sent = [self._payload(reply, (record,)) for reply in valid]
+            norms = [privacy.norm(payload) for payload in sent]
+            limit = self.config.update_cap * float(np.median(norms))
+            for reply, length, payload in zip(valid, norms, sent, strict=True):
+                if length > limit:
+                    self._replace(reply, privacy.clipped(payload, limit))
+                    who = self.roster.name(reply.metadata.src_node_id)
+                    self.report(server_round, who, "capped", {"record": record, "norm": length, "limit": limit})
+
+    def _payload(self, reply: Message, records: tuple[str, ...] = ()) -> privacy.Payload:
         """Return what a client contributes: the change of the weights, and the extra records."""
-        together = self.records if privacy.weighs_alike(self.config) else (messages.ARRAYS,)
+        together = records or (self.records if privacy.weighs_alike(self.config) else (messages.ARRAYS,))
         content = {name: messages.unpack_arrays(reply.content[name]) for name in together}
-        changes = {name: array - self._global[name] for name, array in content[messages.ARRAYS].items()}
-        return content | {messages.ARRAYS: changes}
+        if ends := content.get(messages.ARRAYS):
+            content[messages.ARRAYS] = {name: array - self._global[name] for name, array in ends.items()}
+        return content
 
     def _replace(self, reply: Message, payload: privacy.Payload) -> None:
-        ends = {name: self._global[name] + change for name, change in payload[messages.ARRAYS].items()}
-        for record, arrays in (payload | {messages.ARRAYS: ends}).items():
-            reply.content[record] = messages.pack_arrays(arrays)
+        for record, arrays in payload.items():
+            ends = {name: self._global[name] + change for name, change in arrays.items()}
+            reply.content[record] = messages.pack_arrays(ends if record == messages.ARRAYS else arrays)
 
     def _report_drift(self, server_round: int, valid: list[Message]) -> None:
         """Report how far the clients' weights are apart, unless only their mean is known."""
@@ -297,15 +313,15 @@ class Checked:
 
     def _check_train(self, reply: Message) -> None:
         expected = messages.train_metrics(privacy.hides_updates(self.config))
-        _check_metrics(reply, (*expected, *getattr(self, "extra_metrics", ())))
-        if _examples(reply) == 0:
+        check_metrics(reply, (*expected, *getattr(self, "extra_metrics", ())))
+        if examples(reply) == 0:
             raise ParameterError("examples", f"{messages.EXAMPLES}=0: a client without training frames has no weight")
         steps = reply.content.metric_records[messages.METRICS][messages.STEPS]
         if not isinstance(steps, int) or steps < 1:
             raise ParameterError("metrics", f"{messages.STEPS}={steps!r}: expected a whole number of steps, 1 or more")
-        announced = self.roster.examples_of.get(reply.metadata.src_node_id, _examples(reply))
-        if _examples(reply) != announced:  # its weight in the average must not change
-            found = f"{messages.EXAMPLES}={_examples(reply)}"
+        announced = self.roster.examples_of.get(reply.metadata.src_node_id, examples(reply))
+        if examples(reply) != announced:  # its weight in the average must not change
+            found = f"{messages.EXAMPLES}={examples(reply)}"
             raise ParameterError("examples", f"{found}, but the client first reported {announced}")
         exchange, extra = self.config.exchange, self._extra_records
         arrays = messages.checked_arrays(reply.content, messages.NOTE, self.shapes, also=extra, exchange=exchange)
@@ -314,37 +330,6 @@ class Checked:
         self._arrived[reply.metadata.src_node_id] = arrays
 
     def _check_evaluate(self, reply: Message, most: int) -> None:
-        _check_metrics(reply, messages.EVALUATE_METRICS)
+        check_metrics(reply, messages.EVALUATE_METRICS)
         node = reply.metadata.src_node_id
         self._rolled_out[node] = unpack_rollouts(reply.content, self.roster.tasks_of.get(node, ()), most)
-
-
-def _require_finite(server_round: int, state: dict[str, Arrays]) -> None:
-    """Raise FloatingPointError if the average, or what the strategy keeps, overflowed; all replies were finite."""
-    for record, arrays in state.items():
-        for name, array in arrays.items():
-            if not np.isfinite(array).all():
-                raise FloatingPointError(
-                    f"round {server_round}: the average overflowed ({record} of {name!r} is not finite): "
-                    "lower lr or server-lr; the last checkpoint is of the round before"
-                )
-
-
-def _check_metrics(reply: Message, expected: tuple[str, ...]) -> None:
-    """Raise ParameterError unless Flower can average the metrics of the reply, weighted by examples."""
-    records = reply.content.metric_records
-    if list(records) != [messages.METRICS]:
-        raise ParameterError("metrics", f"expected one record {messages.METRICS!r} of numbers, got {list(records)}")
-    examples = _examples(reply)
-    if not isinstance(examples, int) or examples < 0:
-        raise ParameterError("examples", f"{messages.EXAMPLES}={examples!r}: expected a number of frames")
-    found = set(records[messages.METRICS])
-    if found != set(expected) and not (found == {messages.EXAMPLES} and examples == 0):
-        raise ParameterError("metrics", f"got {sorted(found)}, expected {sorted(expected)}")
-    for key, value in records[messages.METRICS].items():
-        if isinstance(value, list) or not math.isfinite(value):
-            raise ParameterError("metrics", f"{key}={value!r} is not a finite number")
-
-
-def _examples(reply: Message) -> Any:
-    return reply.content.metric_records[messages.METRICS].get(messages.EXAMPLES)
