@@ -78,6 +78,8 @@ class Config:
     checkpoint_every: int = 200  # gradient steps between checkpoints of local training; 0 keeps only the last
     # evaluation
     validate_every: int = 1  # rounds between saved global models, each evaluated on the held-out episodes
+    keep_last: int = 0  # saved global models that stay on the disk: the last so many; 0 keeps all
+    keep_every: int = 0  # and those of every so many rounds; 0 keeps no more than the last
     eval_every: int = 5  # rounds between closed-loop evaluations; 0 evaluates after the last round only
     eval_rollouts: int = 4  # rollouts per task at each evaluation of the global model
     videos: bool = True  # record the rollouts of the global model on video
@@ -128,8 +130,9 @@ MOST = {  # more is a slip of the keyboard, or takes more memory than there is
     "round_timeout_s": 1e9, "server_lr": 1e6, "clip_norm": 1e9, "noise": 1e6,
     "epsilon_budget": 1e6, "num_malicious": 1e5, "proximal_mu": 1e6, "dirichlet_alpha": 1e6, "chunk_size": 10_000,
     "n_action_steps": 10_000, "lora_rank": 4096, "local_steps": 1e7, "batch_size": 65_536, "alone_steps": 1e9,
-    "lr": 1e9, "warmup_steps": 1e9, "checkpoint_every": 1e9, "validate_every": 1e9, "eval_every": 1e9,
-    "eval_rollouts": 1e6, "client_rollouts": 1e6, "action_tolerance_deg": 360, "seed": 2**63 - 1, "num_threads": 1024,
+    "lr": 1e9, "warmup_steps": 1e9, "checkpoint_every": 1e9, "validate_every": 1e9, "keep_last": 1e9, "keep_every": 1e9,
+    "eval_every": 1e9, "eval_rollouts": 1e6, "client_rollouts": 1e6, "action_tolerance_deg": 360,
+    "seed": 2**63 - 1, "num_threads": 1024,
 }  # fmt: skip
 DEVICE = re.compile(r"cpu|mps|cuda(:\d{1,3})?")
 

@@ -100,6 +100,13 @@ class RunFolder:
         """Return the folder of the global model of a round."""
         return self.root / "global_model" / f"round_{round_number}"
 
+    def remove_models(self, keep_last: int, keep_every: int) -> None:
+        """Remove global models but the last `keep_last` (0: none is removed) and those of every `keep_every` rounds."""
+        rounds = sorted(int(folder.name.removeprefix("round_")) for folder in self.root.glob("global_model/round_*"))
+        for number in rounds[:-keep_last] if keep_last else ():
+            if not keep_every or number % keep_every:
+                shutil.rmtree(self.model_dir(number))
+
     def videos_dir(self, round_number: int, who: str) -> Path:
         """Return the folder of the videos of `who` (``global`` or ``client_K``) in a round."""
         return self.root / "evaluate" / f"round_{round_number}" / who
@@ -133,7 +140,13 @@ def start(config: Config, *, engine: str, **beside: Any) -> Iterator[RunFolder]:
             status = f"failed: {type(error).__name__}: {error}"
             raise
         finally:
-            write_json(root / "stamp.json", {**stamp, "status": status, "wall_s": time.perf_counter() - began})
+            ended = {"status": status, "wall_s": time.perf_counter() - began, "disk_bytes": disk_bytes(root)}
+            write_json(root / "stamp.json", stamp | ended)
+
+
+def disk_bytes(root: Path) -> int:
+    """Return how many bytes the files below a folder have."""
+    return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
 
 
 def hold(root: Path) -> AbstractContextManager:

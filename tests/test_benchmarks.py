@@ -87,6 +87,12 @@ def test_a_federation_is_measured_against_its_clients(run):
     assert row["peak memory [MB]"] > 0
 
 
+def test_a_long_run_is_measured_early_and_late(run):
+    (row,) = run("soak", "--rounds", "8", "--clients", "3")
+    assert row["away"] == 8 and row["clients away"] > 1  # one in each round, not always the same
+    assert row["memory [MB] ratio"] > 0 < row["run folder [MB] ratio"] and row["open files early"] > 0
+
+
 def test_rounds_are_timed_for_each_number_of_clients(run):
     (before,) = run("scale", "--clients", "2", "--engines", "inline")
     rows = run("scale", "--clients", "13", "--engines", "inline")

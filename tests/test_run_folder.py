@@ -35,6 +35,26 @@ def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
     assert all(re.fullmatch(r"\d{8}_\d{6}", root.name) for root in roots)
 
 
+@pytest.mark.parametrize(
+    ("last", "every", "kept"),
+    [
+        (0, 0, [0, 1, 2, 3, 4, 5, 6]),
+        (0, 2, [0, 1, 2, 3, 4, 5, 6]),
+        (2, 0, [5, 6]),
+        (2, 3, [0, 3, 5, 6]),
+        (9, 1, list(range(7))),
+    ],
+)
+def test_a_run_keeps_the_models_that_it_is_asked_to_keep(tmp_path, last, every, kept):
+    with run_folder.start(from_profile("tiny", out=str(tmp_path)), engine="inline") as run:
+        for number in range(7):
+            files.write_atomically(run.model_dir(number) / "model.safetensors", b"12345678")
+            run.remove_models(last, every)
+    assert sorted(int(path.name.removeprefix("round_")) for path in run.root.glob("global_model/*")) == kept
+    on_disk = sum(path.stat().st_size for path in run.root.rglob("*.*") if path.name != "stamp.json")
+    assert 0 <= run_folder.read_stamp(run.root)["disk_bytes"] - on_disk < 5000  # the stamp itself
+
+
 def test_settings_and_stamp_read_back(tmp_path):
     config = from_profile("tiny", out=str(tmp_path), lr=3e-4, seed=7)
     began = time.time()

@@ -144,6 +144,7 @@ class RoundEnd:
         started = time.perf_counter()
         load_arrays(self.bundle.policy, arrays | self.bundle.own)
         model.save_policy(self.bundle, self.run.model_dir(round_number))
+        self.run.remove_models(self.config.keep_last, self.config.keep_every)
         due = measure.rolls_out(self.config, round_number)
         found = measure.measure(
             self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),
