@@ -40,6 +40,7 @@ class Config:
     frames_cap: float = 10.0  # a client counts for at most this many times the median number of frames; 0: no limit
     update_cap: float = 3.0  # an update longer than this many times the median of its round is shortened; 0: no limit
     reply_limit_mb: float = 0.0  # largest reply of a client, in MB; 0: 100, and twice the arrays
+    node_keys: str = ""  # the server's folder of public keys node_K.pub: client K signs its number with that key
     round_timeout_s: float = 14400.0  # seconds that a round waits for replies; later replies are left out
     strategy: str = "fedavg"  # one of `STRATEGIES`, for example fedavg, or module:Class of a Flower strategy of yours
     server_lr: float = 0.0  # server learning rate of fedavgm, fedadam, fedyogi, diloco; 0 uses the strategy's default
@@ -272,7 +273,7 @@ def _cast(key: str, value: Any, kind: type) -> Any:
 
 def absolute(config: Config) -> Config:
     """Make local paths absolute, since Flower's processes choose their own working directory. Hub ids stay."""
-    paths = {name: getattr(config, name) for name in ("data", "base", "resume")}
+    paths = {name: getattr(config, name) for name in ("data", "base", "resume", "node_keys")}
     local = {name: str(Path(path).resolve()) for name, path in paths.items() if path and Path(path).exists()}
     owned = [str(Path(path).resolve()) if Path(path).exists() else path for path in split_names(config.client_data)]
     return replace(config, out=str(Path(config.out).resolve()), client_data=",".join(owned), **local)

@@ -21,6 +21,7 @@ from fedvla_lib.config import Config
 
 PACKAGES = ("fedvla-lib", "lerobot", "flwr", "torch", "transformers", "mujoco", "numpy")
 LIBRARY = Path(__file__).parent
+UNDECISIVE = ("out", "num_threads", "resume", "node_keys", "keep_last", "keep_every")  # settings that no result shows
 
 
 def code_digest(function: Callable[..., Any]) -> str:
@@ -78,8 +79,8 @@ class _WithoutText(ast.NodeTransformer):
 
 
 def deciding(config: Config) -> dict[str, Any]:
-    """Return the settings that decide a run's results: all but out, num_threads and resume."""
-    return {k: v for k, v in asdict(config).items() if k not in ("out", "num_threads", "resume")}
+    """Return the settings that decide a run's results: all but `UNDECISIVE`."""
+    return {k: v for k, v in asdict(config).items() if k not in UNDECISIVE}
 
 
 def config_hash(config: Config) -> str:

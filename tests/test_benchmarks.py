@@ -93,6 +93,12 @@ def test_a_long_run_is_measured_early_and_late(run):
     assert row["memory [MB] ratio"] > 0 < row["run folder [MB] ratio"] and row["open files early"] > 0
 
 
+def test_an_attack_is_tried_with_the_limits_and_without(run):
+    refused, long = run("attacks", "--only", "writes rows as the server's", "sends its update a thousand times")
+    assert refused["as it is"] == "refused" and refused["named"] == "rollouts" and refused["median"] is None
+    assert (long["as it is"], long["without limits"], long["median"]) == ("survived", "lost", "survived")
+
+
 def test_rounds_are_timed_for_each_number_of_clients(run):
     (before,) = run("scale", "--clients", "2", "--engines", "inline")
     rows = run("scale", "--clients", "13", "--engines", "inline")

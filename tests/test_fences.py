@@ -217,7 +217,7 @@ def test_files_and_functions_stay_small():
 
 def test_the_library_stays_small():
     files = [*(ROOT / "fedvla_lib").rglob("*.py")]
-    assert sum(len(file.read_text().splitlines()) for file in files) <= 13_200
+    assert sum(len(file.read_text().splitlines()) for file in files) <= 13_400
 
 
 def test_the_flower_app_has_every_setting_with_its_default():

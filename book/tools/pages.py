@@ -33,12 +33,15 @@ RESULTS_ON = {
         "local_training", "random_access", "control_steps", "peers", "rollouts", "federation", "floor", "busy",
         "start_up",
     ],
-    "book/scale.md": ["scale"],
+    "book/scale.md": ["scale", "secure_aggregation", "soak"],
+    "book/deployment.md": ["attacks"],
     "book/costs.md": ["operations"],
 }  # fmt: skip
 TITLES = {
     "fine_tuning": "fine-tuning: each task alone from the base, on one core",
     "floor": "the floor",
+    "soak": "a long run",
+    "attacks": "attacks tried",
 }
 BENCHMARKS = "benchmarks/results"
 

@@ -20,6 +20,7 @@ from fedvla_lib.config import Config, absolute, check
 from fedvla_lib.engines import app_bundle, credentials, guard, processes, superlink
 from fedvla_lib.engines.processes import FlowerRunError
 from fedvla_lib.engines.superlink import CONNECTION, SuperLink
+from fedvla_lib.federation import messages
 
 HOME = "fedvla-deploy-"  # begins the names of temporary folders
 CONNECTED = "SuperNode ID:"  # logged by a SuperNode once the SuperLink has accepted it
@@ -67,6 +68,7 @@ class Deployment:
 
     def run(self, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
         """Run the app and wait until it ends; raise FlowerRunError if it failed or timed out."""
+        config = replace(config, node_keys=str(self.keys[0].public.parent) if self.keys else "")
         app = app_bundle.stage_app(self.folder, config)
         superlink.require_completed(self.link, self.link.submit(app, timeout_s=timeout_s, watch=watch))
 
@@ -81,6 +83,7 @@ class Deployment:
             node_config += f" data={json.dumps(str(self.data[partition_id]))}"
         trust = ["--root-certificates", str(self.link.files.authority)] if self.link.files else ["--insecure"]
         if self.keys:
+            node_config += f" {messages.KEY}={json.dumps(str(self.keys[partition_id].private))}"
             trust += ["--auth-supernode-private-key", str(self.keys[partition_id].private)]
         address, port = f"127.0.0.1:{self.link.port}", str(processes.free_port())
         return ["flower-supernode", *trust, "--superlink", address, "--node-config", node_config, "--port", port]

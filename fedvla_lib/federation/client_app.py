@@ -19,7 +19,7 @@ from flwr.clientapp.typing import ClientAppCallable, Mod
 from fedvla_lib.config import Config, from_run_config
 from fedvla_lib.data import normalisation
 from fedvla_lib.evaluation import measure
-from fedvla_lib.federation import accountant, messages, privacy, rollout_replies, secure_round
+from fedvla_lib.federation import accountant, messages, node_keys, privacy, rollout_replies, secure_round
 from fedvla_lib.federation.client import LOADERS, WORKER_LOADERS, Client, Loaders, open_client
 from fedvla_lib.federation.quantisation import DOWNWARD, decode, with_feedback
 from fedvla_lib.federation.strategies.fedprox import Proximal
@@ -54,11 +54,7 @@ def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None =
     def query(message: Message, context: Context) -> Message:
         with _reasons_kept(context):
             client = _client(context, loaders)
-        known = {"partition_id": client.partition_id, "num_examples": _weight(client)}
-        known["tasks"] = [] if privacy.hides_updates(client.config) else client.tasks
-        asked = normalisation.asks_clients(client.config)
-        note = messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()) if asked else "")
-        return Message(RecordDict({messages.NOTE: note}), reply_to=message)
+        return Message(RecordDict({messages.NOTE: _introduction(client, context)}), reply_to=message)
 
     @app.train(mods=[_released, *around["train"]])
     def train(message: Message, context: Context) -> Message:
@@ -85,6 +81,16 @@ def _by_handler(mods: Mapping[str, Sequence[Mod]] | None) -> dict[str, list[Mod]
     if mods is not None and not (isinstance(mods, Mapping) and mods.keys() <= set(HANDLERS)):
         raise ValueError(f"mods={mods!r} is not usable: give them by handler ({', '.join(HANDLERS)}), a list for each")
     return {handler: list((mods or {}).get(handler, ())) for handler in HANDLERS}
+
+
+def _introduction(client: Client, context: Context) -> ConfigRecord:
+    """What a client says before training: its number, signed if it has a key, its frames, tasks and statistics."""
+    known = {"partition_id": client.partition_id, "num_examples": _weight(client)}
+    known["tasks"] = [] if privacy.hides_updates(client.config) else client.tasks
+    if key := context.node_config.get(messages.KEY):
+        known["signature"] = node_keys.sign(Path(str(key)), context.run_id, context.node_id, client.partition_id)
+    asked = normalisation.asks_clients(client.config)
+    return messages.make_note(**known, stats=normalisation.pack_stats(client.statistics()) if asked else "")
 
 
 def _trained(client: Client, bundle: Bundle, message: Message, context: Context) -> RecordDict:

@@ -27,6 +27,7 @@ EXAMPLES = "num-examples"  # training frames: the weight of a client
 STEPS = "steps"  # gradient steps that the client counted while training
 DIGEST = "sha256"  # of the arrays
 PROXIMAL_MU = "proximal-mu"  # Flower's own key
+KEY = "key"  # in a node's config: the file of its private key, to sign its number with
 DATA = "data"  # in a node's config: the client's own data set
 PARTITION = "partition-id"  # Flower's own key in a node's config
 STATS = "stats"

@@ -13,6 +13,7 @@ from flwr.serverapp import Grid
 from fedvla_lib.config import sample_size
 from fedvla_lib.data.normalisation import Stats, implausible, unpack_stats
 from fedvla_lib.federation.messages import NOTE, count_bytes
+from fedvla_lib.federation.node_keys import Proof
 from fedvla_lib.policy.parameters import ParameterError
 from fedvla_lib.robot.spec import ACTION_KEY, NUM_JOINTS, STATE_KEY
 
@@ -43,6 +44,7 @@ class Roster:
     most_frames: int = MOST_FRAMES  # 1 if all clients count alike
     num_clients: int = MOST_FRAMES  # partitions that there are
     frames_cap: float = 0.0  # see `Config`
+    proof: Proof | None = None  # that a node holds the key of its number, see `node_keys`
 
     @property
     def nodes(self) -> list[int]:
@@ -96,6 +98,8 @@ class Roster:
         if type(partition_id) is not int or not 0 <= partition_id < self.num_clients:  # True is an int as well
             text = f"partition-id={partition_id!r}: expected a number from 0, below num-clients={self.num_clients}"
             raise ParameterError("partition", text)
+        if self.proof:
+            self.proof(node, partition_id, note.get("signature"))
         if holder := [other for other, taken in self.partition_of.items() if taken == partition_id]:
             raise ParameterError("partition", f"partition-id={partition_id!r} is held by node {holder[0]}, the first")
         if type(num_examples) is not int or not 0 < num_examples <= self.most_frames:

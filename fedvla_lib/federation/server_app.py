@@ -6,6 +6,7 @@ It leaves the path of the run folder in ``context.state["run"]["folder"]``.
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from flwr.app import ArrayRecord, ConfigRecord, Context, MetricRecord
@@ -16,10 +17,11 @@ from fedvla_lib.config import Config, from_run_config, task_names
 from fedvla_lib.data import frame_store, normalisation
 from fedvla_lib.evaluation import measure
 from fedvla_lib.evaluation.rollouts import rollout_seeds, tasks_to_roll_out
-from fedvla_lib.federation import checkpoint, messages, privacy
+from fedvla_lib.federation import checkpoint, messages, node_keys, privacy
 from fedvla_lib.federation.accountant import open_ledger
 from fedvla_lib.federation.checkpoint import Checkpoint
 from fedvla_lib.federation.client import LOADERS, Loaders
+from fedvla_lib.federation.node_keys import Proof
 from fedvla_lib.federation.nodes import Roster, TooFewReplies, introduce_nodes, wait_for_nodes
 from fedvla_lib.federation.rollout_replies import Rollouts
 from fedvla_lib.federation.secure_round import SecureGrid
@@ -59,14 +61,18 @@ def build(loaders: Loaders = LOADERS, *, engine: str = "flower", progress: bool 
     @app.main()
     def main(grid: Grid, context: Context) -> None:
         config = from_run_config(context.run_config)
+        proof = node_keys.proof(Path(config.node_keys), context.run_id) if config.node_keys else None
+        config = replace(config, node_keys="")  # a run may be resumed with other keys
         with run_folder.start(config, engine=engine) as run:
             context.state["run"] = ConfigRecord({"folder": str(run.root)})
-            federate(for_runtime(grid), config, run, loaders, progress, jobs)
+            federate(for_runtime(grid), config, run, loaders, progress, jobs, proof)
 
     return app
 
 
-def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, jobs: int = 1) -> None:
+def federate(
+    grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progress: bool, jobs: int, proof: Proof | None
+) -> None:
     """Run or resume a federation on `grid` and write it to `run`.
 
     Raises:
@@ -78,7 +84,7 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     saved = _resume_from(config, run, states)
     # Before any client does: they would all record the same data. A server whose clients have the data may have none.
     store = loaders.open_frames(config) if config.data or not config.client_data else None
-    roster = _introduce(grid, config, run, again=saved is not None)
+    roster = _introduce(grid, config, run, saved is not None, proof)
     pooled = normalisation.pool_stats(roster.plausible_stats(run.log)) if normalisation.asks_clients(config) else {}
     stats = normalisation.common_statistics(config, pooled)
     bundle = model.load_policy(config, normalisation.evaluation_statistics(config, stats, store))
@@ -96,16 +102,12 @@ def federate(grid: Grid, config: Config, run: RunFolder, loaders: Loaders, progr
     if saved:
         strategy.load_state(checkpoint.nested(saved.strategy))
     measured = _measured(config, store, roster, None if saved else run)
-    packed = normalisation.pack_stats(stats)
+    sent = {messages.STATS: normalisation.pack_stats(stats)}
     strategy.start(
-        grid,
-        messages.pack_arrays(arrays),
-        num_rounds=config.num_server_rounds - done,
-        timeout=config.round_timeout_s,
-        train_config=ConfigRecord({messages.STATS: packed}),
-        evaluate_config=ConfigRecord({messages.STATS: packed}),
+        grid, messages.pack_arrays(arrays), config.num_server_rounds - done, config.round_timeout_s,
+        train_config=ConfigRecord(sent), evaluate_config=ConfigRecord(sent),
         evaluate_fn=RoundEnd(measured, store, bundle, run, strategy, states, saved is not None, progress, jobs),
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -191,15 +193,16 @@ def _resume_from(config: Config, run: RunFolder, states: ClientStates | None) ->
     return found
 
 
-def _introduce(grid: Grid, config: Config, run: RunFolder, again: bool) -> Roster:
+def _introduce(grid: Grid, config: Config, run: RunFolder, again: bool, proof: Proof | None) -> Roster:
     """Ask clients for partition, frame count and statistics; none of their other data leaves them.
 
     Args:
         again: they introduced themselves to an earlier process of this run, which logged it.
+        proof: that a client holds the key of its number.
     """
     nodes = wait_for_nodes(grid, config.num_clients, CONNECT_TIMEOUT_S)
     asked = {"needs_stats": normalisation.asks_clients(config), "num_clients": config.num_clients}
-    asked["frames_cap"] = config.frames_cap
+    asked |= {"frames_cap": config.frames_cap, "proof": proof}
     if privacy.weighs_alike(config):
         asked["most_frames"] = 1
     roster = introduce_nodes(grid, nodes, run.log, config.round_timeout_s, **asked)
