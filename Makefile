@@ -5,6 +5,7 @@
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make test-full-size, make test-gpu   the profile gpu with random weights, on the CPU or on a card
 # make check-zip   every chapter as a reader of the zip runs it (make test does it too)
+# make sbom, make audit   the locked packages as a bill of materials; known advisories about them (needs the network)
 # make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
 #
@@ -14,7 +15,7 @@
 # share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS (chapters that
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
 .DEFAULT_GOAL := help
-.PHONY: help env address book check-site check-zip data doctor test test-full-size test-gpu lint lab lock new-chapter zip pdf clean
+.PHONY: help env address audit book sbom check-site check-zip data doctor test test-full-size test-gpu lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -101,6 +102,15 @@ zip: $(STAMP)
 # Every chapter from that zip, at the profile tiny: an empty folder, and the wheel in place of the source.
 check-zip: $(STAMP)
 	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile
+
+# The locked packages as a bill of materials (CycloneDX), for whoever has to know what is installed.
+sbom: $(UV)
+	@mkdir -p _build
+	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements $(LOCK) --output-reproducible --of JSON -o _build/sbom.json
+
+# Needs the network: are there known advisories about what is locked?
+audit: $(UV)
+	$(UV) tool run --quiet pip-audit==2.10.1 --require-hashes --disable-pip -r $(LOCK)
 
 # Needs the executed chapters of `make book`, and the system's Chromium.
 pdf: $(STAMP)

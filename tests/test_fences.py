@@ -194,6 +194,16 @@ def test_nothing_can_load_a_pickle():
     assert not {name for name, tree in everything.items() if any(word in ast.unparse(tree) for word in words)}
 
 
+def test_no_text_is_run_as_code_or_by_a_shell():
+    """A name of a file, a host or a task may come from a stranger: lists of arguments are not parsed again."""
+    everything = MODULES | BOOK
+    words = ("shell=True", "os.system", "os.popen")
+    assert not {name for name, tree in everything.items() if any(word in ast.unparse(tree) for word in words)}
+    calls = {(name, node.func.id) for name, tree in everything.items() for node in ast.walk(tree)
+             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}  # fmt: skip
+    assert not {name for name, called in calls if called in ("eval", "exec")}
+
+
 def test_there_is_no_drawer_for_odds_and_ends():
     assert not {"utils", "helpers", "common", "misc"} & {part for name in MODULES for part in name.split(".")}
 
