@@ -53,6 +53,14 @@ def test_healthy_recordings_of_all_tasks_and_of_several_labs_raise_no_alarm(reco
     assert report.training["chunk_s"] == 1.6 and report.training["held_out_episodes"] == 3
 
 
+@pytest.mark.integration
+def test_a_map_of_cameras_is_that_of_the_data_and_not_of_the_reference(recording):
+    """What the doctor prints as a mend for swapped cameras: the same call with it must come out otherwise."""
+    wrong = replace(CONFIG, camera_map="overhead=front,front=overhead")
+    found = alarms(inspection.inspect(recording, wrong, recording).findings)
+    assert [finding.mend for finding in found] == ["--camera-map front=front,overhead=overhead"]
+
+
 # --- one kind of damage each, in arrays -----------------------------------------------------------------------------
 
 

@@ -78,13 +78,21 @@ def inspect(source: str | Path, config: Config, reference: str | Path | None = N
     """
     root, cameras = find(source), camera_names(config)
     recorded = read_recorded(root, cameras)
-    beside = read_recorded(find(reference), cameras) if reference else None
+    beside = _read_reference(find(reference), cameras) if reference else None
     found = check(recorded, beside, partial(remove_command, root), edit_command(root)) if recorded.takes else []
     findings = recorded.damaged + found
     counts = Counter(task_of(take.instruction) for take in recorded.takes)
     facts, notes = _training(recorded, config, counts)
     findings = sorted(findings + notes, key=lambda finding: SEVERITIES.index(finding.severity))
     return Report(findings, dict(counts.most_common()), facts)
+
+
+def _read_reference(root: Path, cameras: Cameras | None) -> Recorded:
+    """Read a reference by the names of its own cameras; if they say nothing, they may be named as in the data set."""
+    try:
+        return read_recorded(root)
+    except DataError:
+        return read_recorded(root, cameras)
 
 
 def read_recorded(root: Path, cameras: Cameras | None = None) -> Recorded:
