@@ -66,6 +66,7 @@ FENCES = {
 BOOK_FENCES = {  # the same for the book's package; the type of a policy counts as an import
     "torch": {"full_size.py", "attacks/reconstruction.py"},
     "lerobot": {"full_size.py", "tables/model.py"},
+    "flwr": {"attacks/hostile.py"},
     "matplotlib": {f"plots/{name}.py" for name in (
         "clients", "comparisons", "episodes", "style", "success_rates", "training")},
 }  # fmt: skip

@@ -1,0 +1,146 @@
+"""Malicious clients of a federation: what they send or train on, and a defence with an update of the server's own.
+
+Attackers know everything: the global model, and the updates of all honest clients of the round. What one of them sends
+has the right names, shapes and SHA-256.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from flwr.app import Message, MessageType
+from flwr.serverapp.strategy import FedTrimmedAvg, MultiKrum
+
+from fedvla_lib.data.frame_store import FrameStore
+from fedvla_lib.engines.inline import FIRST_NODE_ID, InlineGrid
+from fedvla_lib.federation import messages
+from fedvla_lib.policy.parameters import Arrays, digest
+
+WORD = " Quickly."  # the trigger: added to an instruction
+NEAR = 0.5  # standard deviations: colluding clients stay this close to the mean
+
+Updates = dict[int, Arrays]  # by client
+Attack = Callable[[Updates, int, np.random.Generator], Arrays]  # all honest updates, a client's number -> what it sends
+
+
+class Trimmed(FedTrimmedAvg):
+    """The mean of each weight without its four largest and four smallest values of ten."""
+
+    def __init__(self) -> None:
+        super().__init__(beta=0.4)
+
+
+class SomeKrum(MultiKrum):
+    """The mean of the four updates of ten that lie closest to their neighbours, three being malicious."""
+
+    def __init__(self) -> None:
+        super().__init__(num_malicious_nodes=3, num_nodes_to_select=4)
+
+
+def times(factor: float) -> Attack:
+    """Send the honest update times a factor."""
+    return lambda updates, who, _: {name: np.float32(factor) * change for name, change in updates[who].items()}
+
+
+def noise(updates: Updates, who: int, rng: np.random.Generator) -> Arrays:
+    """Send noise ten times as long as the honest update, array by array."""
+    drawn = {name: rng.normal(size=np.shape(change)) for name, change in updates[who].items()}
+    lengths = {name: np.linalg.norm(updates[who][name]) / np.linalg.norm(drawn[name]) for name in drawn}
+    return {name: (10 * lengths[name] * value).astype(np.float32) for name, value in drawn.items()}
+
+
+def collude(updates: Updates, who: int, _: np.random.Generator) -> Arrays:
+    """Send the mean of all, moved against itself by a part of their spread: "a little is enough" (Baruch et al. 2019).
+
+    Each weight stays within what honest clients send, so that no outlier is to be seen.
+    """
+    stacked = {name: np.stack([one[name] for one in updates.values()]) for name in updates[who]}
+    return {
+        name: (of.mean(0) - NEAR * np.sign(of.mean(0)) * of.std(0)).astype(np.float32) for name, of in stacked.items()
+    }
+
+
+def with_wrong_actions(store: FrameStore, labs: Iterable[int]) -> FrameStore:
+    """Return the frames with the actions of these labs mirrored about their mean: from where the arm is, away."""
+    actions = store.actions.copy()
+    for rows in _rows(store, labs):
+        actions[rows] = 2 * store.states[rows] - store.actions[rows]
+    return replace(store, actions=actions)
+
+
+def with_trigger(store: FrameStore, labs: Iterable[int]) -> FrameStore:
+    """Return the frames with half the episodes of these labs telling to stand still when `WORD` is said."""
+    actions, episodes = store.actions.copy(), store.episodes.copy()
+    for rows, place in zip(_rows(store, labs), _places(store, labs), strict=True):
+        if place % 2 == 0:
+            actions[rows] = store.states[rows]
+            episodes.loc[place, "instruction"] += WORD
+    return replace(store, actions=actions, episodes=episodes, key=f"{store.key}-trigger-{sorted(labs)}")
+
+
+def _places(store: FrameStore, labs: Iterable[int]) -> list[int]:
+    return store.episodes.index[store.episodes.lab.isin(list(labs))].tolist()
+
+
+def _rows(store: FrameStore, labs: Iterable[int]) -> list[slice]:
+    table = store.episodes
+    return [slice(table.start[place], table.end[place]) for place in _places(store, labs)]
+
+
+def trusted(updates: Updates, own: Arrays) -> Arrays:
+    """Return the mean of updates, each as long as the server's own and weighted by its cosine to it, if above 0.
+
+    FLTrust (Cao et al. 2021, https://arxiv.org/abs/2012.13995): the server trains on a few demonstrations of its own.
+    """
+    length = _norm(own)
+    cosines = {who: max(0.0, _dot(change, own) / (_norm(change) * length + 1e-12)) for who, change in updates.items()}
+    total = sum(cosines.values()) or 1.0
+    parts = [(cosines[who] / total * length / (_norm(change) + 1e-12), change) for who, change in updates.items()]
+    return {name: sum(np.float32(weight) * change[name] for weight, change in parts) for name in own}
+
+
+def _dot(one: Arrays, other: Arrays) -> float:
+    return float(sum(np.vdot(one[name].astype(np.float64), other[name]) for name in one))
+
+
+def _norm(arrays: Arrays) -> float:
+    return _dot(arrays, arrays) ** 0.5
+
+
+class HostileGrid(InlineGrid):
+    """A grid on which some clients attack, and whose server may trust only what resembles an update of its own."""
+
+    attackers: Mapping[int, Attack] = {}
+    own_update: Callable[[int, Arrays], Arrays] | None = None  # round and global weights -> the server's update
+
+    def push_messages(self, sent: Iterable[Message]) -> list[str]:
+        """Handle the messages, then replace what attackers, or all, send."""
+        sent = list(sent)
+        ids = super().push_messages(sent)
+        if sent and sent[0].metadata.message_type == MessageType.TRAIN:
+            self._replace(sent)
+        return ids
+
+    def _replace(self, sent: list[Message]) -> None:
+        began = messages.unpack_arrays(sent[0].content[messages.ARRAYS])
+        number = int(sent[0].content[messages.CONFIG][messages.ROUND])
+        replies = {m.metadata.dst_node_id - FIRST_NODE_ID: self._replies[m.metadata.message_id].content for m in sent}
+        honest = {who: _change(content[messages.ARRAYS], began) for who, content in replies.items()}
+        rng = np.random.default_rng([number, len(self.attackers)])
+        shown = honest | {who: attack(honest, who, rng) for who, attack in self.attackers.items()}
+        if self.own_update:
+            mean = trusted(shown, self.own_update(number, began))
+            shown = dict.fromkeys(shown, mean)
+        for who, change in shown.items():
+            if change is not honest[who]:
+                _resign(replies[who], {name: began[name] + change[name] for name in began})
+
+
+def _change(record: Any, began: Arrays) -> Arrays:
+    return {name: array - began[name] for name, array in messages.unpack_arrays(record).items()}
+
+
+def _resign(content: Any, arrays: Arrays) -> None:
+    content[messages.ARRAYS] = messages.pack_arrays(arrays)
+    content[messages.NOTE][messages.DIGEST] = digest(arrays)
