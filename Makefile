@@ -4,7 +4,7 @@
 # make new-chapter NAME=12_force     a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make test-full-size, make test-gpu   the profile gpu with random weights, on the CPU or on a card
-# make check-zip   every chapter as a reader of the zip runs it (make test does it too)
+# make check-zip   every chapter as a reader of the zip runs it (make book FROM_ZIP=1 does it too)
 # make sbom, make audit   the locked packages as a bill of materials; known advisories about them (needs the network)
 # make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)
 # make clean  remove the built book and the test reports (environment, recordings and run folders stay)
@@ -87,9 +87,9 @@ doctor: $(STAMP)
 data: $(STAMP)
 	$(BIN)/fedvla record
 
-# Records the demonstrations first, unless no chapter has to be executed.
+# Records the demonstrations first, unless no chapter has to be executed. FROM_ZIP=1: the chapters as readers of the zip run them.
 book: doctor
-	$(BIN)/python book/tools/build_book.py --profile $(FEDVLA_PROFILE) $(if $(BOOK_JOBS),--jobs $(BOOK_JOBS))
+	$(BIN)/python book/tools/build_book.py --profile $(FEDVLA_PROFILE) $(if $(BOOK_JOBS),--jobs $(BOOK_JOBS)) $(if $(FROM_ZIP),--from-zip)
 
 # Every page of the rendered book, in the system's Chromium.
 check-site: $(STAMP)
@@ -130,15 +130,15 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md book/*.md notebooks/*.ipynb
 
-# Coverage counts the tests alone. The chapters then run at the tiny profile, with nbmake, as the reader of the zip runs them:
-# from the wheel. In this folder, with injected parameters (papermill), `make book` runs them; .ci/run does both.
+# Coverage counts the tests alone. Two chapters then run with nbmake, as a reader of the zip may run them: unpacked, with the
+# library from the wheel. `make book FROM_ZIP=1` runs all of them so, with papermill, and shows what came out; .ci/run does both.
 test: export FEDVLA_PROFILE := tiny
 test: export HF_HUB_OFFLINE := 1
 test: export COVERAGE_CORE := sysmon
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
-	$(BIN)/python book/tools/check_zip.py -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
+	$(BIN)/python book/tools/check_zip.py --only 02_ 05_ -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
 
 # The profile `gpu` with random weights: on the CPU, which takes 9 GB and up to half an hour, or on a card.
 test-full-size: $(STAMP)

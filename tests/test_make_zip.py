@@ -42,7 +42,7 @@ def test_its_readme_names_what_is_there(unpacked):
 
 
 def test_chapters_run_from_the_wheel_and_one_that_does_not_fails(unpacked, tmp_path, capfd):
-    """In an empty folder and a new environment; `make test` does it with every chapter."""
+    """In an empty folder and a new environment; `make test` does it with some chapters."""
     book = shutil.copytree(unpacked, tmp_path / "book", ignore=shutil.ignore_patterns("*.ipynb"))
     python, codes = check_zip.new_environment(book), {"wheel": "import fedvla_lib", "source": SEES_THE_SOURCE}
     for name, code in codes.items():

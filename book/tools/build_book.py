@@ -1,6 +1,7 @@
 """Execute the chapters that changed and build the HTML book from the executed copies.
 
     python book/tools/build_book.py --profile laptop
+    python book/tools/build_book.py --profile tiny --from-zip    the chapters unpacked, the library from the wheel
 
 The executed copies and the pages go to `_build/<profile>/source`, which Jupyter Book renders: execution off, warnings
 as errors.
@@ -12,10 +13,13 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+import check_zip
+import fedvla_lib
 from execution import (
     BookError,
     Chapter,
@@ -89,10 +93,43 @@ def _undescribed_images(page: Path) -> int:
     return sum(text is None or not text[1] or "_images/" in text[1] for text in texts)
 
 
-def build(root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1) -> Path | None:
-    """Execute changed chapters and, unless `execute_only`, build the book; return its front page."""
+def execute_from_zip(profile: str, only: str, jobs: int) -> None:
+    """Execute the changed chapters as readers of the zip have them: unpacked, with the library of the wheel.
+
+    In a process of its own, whose Python sees that library and not the source.
+    """
+    with tempfile.TemporaryDirectory(prefix="fedvla-book-") as folder:
+        book, python = check_zip.prepared(Path(folder))
+        command = [
+            str(python),
+            str(Path(__file__).resolve()),
+            "--profile",
+            profile,
+            "--only",
+            only,
+            "--jobs",
+            str(jobs),
+        ]
+        done = subprocess.run(
+            [*command, "--execute-only", "--inside", str(book)], cwd=book, env=check_zip.surroundings(python, profile),
+            check=False,
+        )  # fmt: skip
+    if done.returncode:
+        raise BookError("a chapter of the unpacked zip failed, see above")
+
+
+def build(
+    root: Path, profile: str, only: str, execute_only: bool, jobs: int = 1, inside: Path | None = None
+) -> Path | None:
+    """Execute changed chapters and, unless `execute_only`, build the book; return its front page.
+
+    Args:
+        inside: an unpacked book whose copies of the chapters are executed.
+    """
     start = time.monotonic()
-    chapters = execute_chapters(root, profile, only, prepare=record_data, jobs=jobs)
+    if inside and not Path(fedvla_lib.__file__).is_relative_to(sys.prefix):
+        raise BookError(f"{fedvla_lib.__file__} is not the library of the wheel")
+    chapters = execute_chapters(root, profile, only, prepare=record_data, jobs=jobs, inside=inside)
     if execute_only:
         print(f"{len(chapters)} chapters executed with profile {profile}", flush=True)
         return None
@@ -146,13 +183,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="execute the chapters whose name contains TEXT")
     parser.add_argument("--execute-only", action="store_true", help="execute the chapters, build no pages")
     parser.add_argument("--jobs", type=int, metavar="N", help="chapters executed at once (default: one per core)")
+    parser.add_argument("--from-zip", action="store_true", help="execute the chapters as readers of the zip do")
+    parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)  # for the process that --from-zip starts
     options = parser.parse_args(argv)
     if options.jobs is not None and options.jobs < 1:
         parser.error(f"--jobs {options.jobs} is not usable: give a whole number of 1 or more")
     try:
         whole = not (options.execute_only or options.only)
-        device = from_profile(options.profile).device
-        front_page = build(ROOT, options.profile, options.only, not whole, options.jobs or default_jobs(device))
+        jobs = options.jobs or default_jobs(from_profile(options.profile).device)
+        if options.from_zip:
+            execute_from_zip(options.profile, options.only, jobs)
+        front_page = build(ROOT, options.profile, options.only, not whole, jobs, options.inside)
     except (ValueError, OSError) as error:
         print(f"the book was not built: {error}", file=sys.stderr)
         return 2

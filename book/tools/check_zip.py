@@ -1,7 +1,7 @@
 """Execute chapters as readers of the zip do: unpacked in an empty folder, with the library installed from its wheel.
 
     python book/tools/check_zip.py              every chapter, with profile tiny
-    python book/tools/check_zip.py --only 02
+    python book/tools/check_zip.py --only 02 05
     python book/tools/check_zip.py -n 2         other options are passed to pytest: here, two chapters in parallel
 
 A new environment sees this one's packages, but not the source of the library; pytest --nbmake runs in it. Cached
@@ -65,14 +65,20 @@ def new_environment(book: Path) -> Path:
     return python
 
 
-def surroundings(python: Path) -> dict[str, str]:
+def prepared(folder: Path) -> tuple[Path, Path]:
+    """Make and unpack the zip in an empty folder; return the unpacked book and the Python of its environment."""
+    book = unpack(make_zip.make(make_zip.ROOT, folder / "fedvla-book.zip"), folder)
+    return book, new_environment(book)
+
+
+def surroundings(python: Path, profile: str = "tiny") -> dict[str, str]:
     """Return the environment variables of a shell with that Python's environment activated.
 
     Chapters compute on one thread and in one process, so that several can run in parallel.
     """
     outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     path = f"{python.parent}{os.pathsep}{outside['PATH']}"
-    return {"OMP_NUM_THREADS": "1", "FEDVLA_JOBS": "1"} | outside | {"FEDVLA_PROFILE": "tiny", "PATH": path}
+    return {"OMP_NUM_THREADS": "1", "FEDVLA_JOBS": "1"} | outside | {"FEDVLA_PROFILE": profile, "PATH": path}
 
 
 def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()) -> int:
@@ -91,18 +97,18 @@ def execute(notebooks: Sequence[Path], python: Path, options: Sequence[str] = ()
     return subprocess.run(command, cwd=book, env=surroundings(python), check=False).returncode
 
 
-def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
-    """Execute the chapters whose name contains `only` in an empty folder; return pytest's exit status.
+def check(folder: Path, only: Sequence[str] = (), options: Sequence[str] = ()) -> int:
+    """Execute the chapters whose name contains one of `only`, or all, in an empty folder; return pytest's exit status.
 
     Raises:
         ValueError: there is no such chapter, or the demonstrations could not be recorded.
     """
-    book = unpack(make_zip.make(make_zip.ROOT, folder / "fedvla-book.zip"), folder)
-    notebooks = [path for path in sorted((book / "notebooks").glob("*.ipynb")) if only in path.stem]
+    book, python = prepared(folder)
+    every = sorted((book / "notebooks").glob("*.ipynb"))
+    notebooks = [path for path in every if not only or any(text in path.stem for text in only)]
     if not notebooks:
-        raise ValueError(f"no chapter of the zip has {only!r} in its name")
+        raise ValueError(f"no chapter of the zip has one of {list(only)} in its name")
     notebooks.reverse()  # the last chapters take longest, so start them first
-    python = new_environment(book)
     record = [str(python.parent / "fedvla"), "record", "--profile", "tiny"]  # as the zip's README says
     if subprocess.run(record, cwd=book, env=surroundings(python), check=False).returncode:
         raise ValueError(f"{shlex.join(record[1:])} failed in the unpacked book")
@@ -112,7 +118,7 @@ def check(folder: Path, only: str = "", options: Sequence[str] = ()) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Check the zip; pytest prints the time of each chapter."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
-    parser.add_argument("--only", default="", metavar="TEXT", help="the chapters whose name contains TEXT")
+    parser.add_argument("--only", nargs="+", default=(), metavar="TEXT", help="chapters whose name contains a TEXT")
     known, options = parser.parse_known_args(argv)
     try:
         with tempfile.TemporaryDirectory(prefix="fedvla-check-") as folder:

@@ -127,11 +127,14 @@ def reuse(notebook: Path, folder: Path, library: str) -> Chapter | None:
     return Chapter(notebook.stem, target, key, stamp["seconds"], reused=True)
 
 
-def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time: int = 1) -> Chapter:
+def execute(
+    notebook: Path, folder: Path, profile: str, library: str, at_a_time: int = 1, inside: Path | None = None
+) -> Chapter:
     """Execute `notebook` with `profile` and write the executed copy to `folder`.
 
     Args:
         at_a_time: number of chapters executed in parallel, for the status page.
+        inside: an unpacked book, whose copy of the notebook is executed; None: the notebook, in its folder.
 
     Raises:
         BookError: a parameter is missing or a cell failed; the message names the copy that shows the failure.
@@ -140,7 +143,8 @@ def execute(notebook: Path, folder: Path, profile: str, library: str, at_a_time:
     parameters = {"profile": profile}
     check_parameters(notebook, parameters)
     environment = status.environment(notebook, profile)
-    seconds = _execute(notebook, target, parameters, has_bar=at_a_time == 1 and sys.stderr.isatty())
+    copy = inside / "notebooks" / notebook.name if inside else notebook
+    seconds = _execute(copy, target, parameters, has_bar=at_a_time == 1 and sys.stderr.isatty())
     cost = {"seconds": round(seconds, 1), "at_a_time": at_a_time}
     _finish(target, {"key": key, "profile": profile, **cost, "environment": environment})
     return Chapter(notebook.stem, target, key, seconds, reused=False)
@@ -192,13 +196,15 @@ def _finish(target: Path, stamp: dict[str, object]) -> None:
 
 
 def execute_chapters(
-    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None, jobs: int = 1
-) -> list[Chapter]:
+    root: Path, profile: str, only: str = "", prepare: Callable[[str], None] = lambda profile: None, jobs: int = 1,
+    inside: Path | None = None,
+) -> list[Chapter]:  # fmt: skip
     """Execute the changed chapters of the table of contents whose name contains `only`, and print their times.
 
     Args:
         prepare: called with the profile if any chapter has to be executed, before the first.
         jobs: chapters executed at a time; one that uses another's run (``fedvla.after`` in its metadata) waits for it.
+        inside: an unpacked book whose copies are executed.
     """
     library, folder = library_key(root, profile), executed_folder(root, profile)
     notebooks = [path for path in notebooks_of(root) if only in path.stem]
@@ -213,7 +219,7 @@ def execute_chapters(
         if chapters[path]:
             print(f"{place[path]}: {_cost(chapters[path])}", flush=True)
     needed = {path: {path.with_stem(name) for name in _metadata(path).get("after", [])} for path in changed}
-    work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs)
+    work = partial(_announced, place, folder=folder, profile=profile, library=library, at_a_time=jobs, inside=inside)
     order = _longest_first(changed, needed, root / COSTS / f"{profile}.json") if jobs > 1 else changed
     for path, chapter in _one_after_another(work, order, jobs, needed):
         chapters[path] = chapter
