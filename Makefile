@@ -19,7 +19,7 @@
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
-TEST_WORKERS ?= 2
+TEST_WORKERS ?= 3
 BIN := .venv/bin
 UV := .uv/bin/uv
 LOCK := requirements.lock
