@@ -125,8 +125,8 @@ def test_stored_attacks_become_tables(tmp_path):
     read = {"update": 0.0, "update in 8 bits": "not possible", "blind": 10.0}
     assert results.states(found).loc["gradient"].to_dict() == read
     assert "9.0 dB" in results.images(found) and "0% of 1 images" in results.images(found)
-    table = results.protections(found, lambda noise: 5 / noise, 0.079)
-    assert table["epsilon of a round, delta 0.08"].tolist() == ["none", "500.0", "50.0", "16.7", "none", "0.0"]
+    table = results.protections(found, lambda noise, rounds: 5 * rounds / noise, 1e-5)
+    assert table["epsilon of 1 round, delta 1e-05"].tolist() == ["none", "500.0", "50.0", "16.7", "none", "0.0"]
     assert [name for name in table.index if "noise" in name] == [f"noise {z} of each lab" for z in (0.01, 0.1, 0.3)]
     assert table.loc["none", "task"].startswith("100%") and table.loc["sums only", "member (area)"].startswith("0.8")
     assert results.members(found).loc["one update", "asked"] == 6

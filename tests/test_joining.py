@@ -34,7 +34,7 @@ def test_gains_are_those_of_the_stored_runs_whoever_is_ahead(said):
         assert [float(row[0]) for row in rows_of(table)] == counts
         assert all("[" in row[column] for row in rows_of(table))
     gaps = tables.differences(home.sort_values("demonstrations"), [("federated", "centralized")], seed=0)
-    found = [row[4].split("\N{NO-BREAK SPACE}")[0] for row in rows_of(said["<!-- gain -->"])]
+    found = [row[5].split("\N{NO-BREAK SPACE}")[0] for row in rows_of(said["<!-- gain -->"])]
     assert found == [f"{100 * gap:+.0f}" for gap in gaps.difference]
 
 

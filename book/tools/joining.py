@@ -82,7 +82,10 @@ def _seeds(folder: Path, rows: pd.DataFrame) -> str:
     """How many of the planned training seeds have been run, below a table."""
     planned = {cell.seed for cell in read_plan(folder.with_suffix(".toml")).cells}
     run = rows.groupby(["method", "partition"]).run.nunique().min()
-    wide = "" if run == len(planned) else " An interval from few seeds can come out far too wide or too narrow."
+    wide = (
+        "" if run == len(planned) else " An interval from few seeds can come out far too wide or too narrow, and rates "
+        "over other seeds than those of question 2 differ from those there: draw no conclusion yet."
+    )  # fmt: skip
     return f"\n\nAt least {run} of {len(planned)} planned training seeds have been run.{wide}"
 
 

@@ -18,7 +18,7 @@ Thumbnails = Mapping[str, Sequence[np.ndarray]]  # camera -> uint8 (T, SIDE, SID
 
 
 def small(image: np.ndarray) -> np.ndarray:
-    """Return every so manieth pixel of uint8 (H, W, 3) as uint8 (SIDE, SIDE, 3)."""
+    """Return every n-th pixel of uint8 (H, W, 3) as uint8 (SIDE, SIDE, 3)."""
     rows, columns = (np.linspace(0, length - 1, SIDE).round().astype(int) for length in image.shape[:2])
     return image[np.ix_(rows, columns)]
 

@@ -70,6 +70,21 @@ def guesses(found: pd.DataFrame) -> str:
     return " ".join(parts)
 
 
+def shown(found: pd.DataFrame, steps: int = 40, demos: int = 2) -> str:
+    """Return a sentence on which attacks on an update without noise are above chance, and which are not shown to be."""
+    rows, outcome = found[(found.saw == "one update") & (found.noise == 0)], {True: [], False: []}
+    for trait in ("task", "place"):
+        right, count = rows[(rows.attack == trait) & (rows.steps == steps)][["right", "of"]].sum()
+        low, _ = proportion_confint(right, count, method="wilson")
+        outcome[bool(low > CHANCE[trait])].append(f"the guess of the {trait}")
+    member = rows[(rows.attack == "member") & (rows.demos == demos)]
+    outcome[_limits(member)[1] > CHANCE["member"]].append(f"membership with {demos} demonstrations")
+    return (
+        f"Without noise the interval is above chance for: {', '.join(outcome[True]) or 'none'}. "
+        f"Not shown to work: {', '.join(outcome[False]) or 'none'}."
+    )
+
+
 def last_readable(found: pd.DataFrame, steps: int = 40) -> float:
     """Return the largest noise multiplier at which nine in ten tasks are guessed from one update."""
     rows = found[(found.saw == "one update") & (found.attack == "task") & (found.steps == steps)]
@@ -99,14 +114,15 @@ def members(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def protections(
-    found: pd.DataFrame, epsilon: Callable[[float], float], delta: float, steps: int = 40, demos: int = 2
+    found: pd.DataFrame, epsilon: Callable[[float, int], float], delta: float, steps: int = 40, demos: int = 2
 ) -> pd.DataFrame:
     """Return the attacks under each protection: what the server finds out about a lab, with intervals.
 
-    Where it sees sums only, it can look for members in the global model, as every lab can.
+    Where it sees sums only, it can test membership on the global model of the last round, as every lab can; one guess
+    of the task, or of the place, is then the same for all labs.
 
     Args:
-        epsilon: of one round, for a noise multiplier, at `delta`.
+        epsilon: for a noise multiplier and a number of rounds, at `delta`.
         steps: local steps of the labs whose task and place are guessed.
         demos: demonstrations of the labs that are asked for members.
     """
@@ -115,10 +131,10 @@ def protections(
     cases |= {f"noise {noise:g} of each lab": ("one update", noise) for noise in levels}
     cases["sums only"] = ("the mean of ten", 0.0)
     table = {name: _attacked(found, saw, noise, steps, demos) for name, (saw, noise) in cases.items()}
-    spent = f"epsilon of a round, delta {delta:.2f}"
+    spent = {rounds: f"epsilon of {rounds} round{'s' * (rounds > 1)}, delta {delta:g}" for rounds in (1, 10)}
     for name, (_, noise) in cases.items():
-        table[name][spent] = f"{epsilon(noise):,.1f}" if noise else "none"
-    chance = {"task": "50%", "place": "10%", "member (area)": "0.50", spent: "0.0"}
+        table[name] |= {text: f"{epsilon(noise, n):,.1f}" if noise else "none" for n, text in spent.items()}
+    chance = {"task": "50%", "place": "10%", "member (area)": "0.50"} | dict.fromkeys(spent.values(), "0.0")
     return pd.DataFrame({**table, "chance": chance}).T
 
 
@@ -127,19 +143,24 @@ def _attacked(found: pd.DataFrame, saw: str, noise: float, steps: int, demos: in
     for trait in ("task", "place"):
         right, count = rows[(rows.attack == trait) & (rows.steps == steps)][["right", "of"]].sum()
         low, high = proportion_confint(right, count, method="wilson")
-        limits = f" {interval(low, high)}" if saw == "one update" else ""  # else one answer for all labs
-        cells[trait] = f"{right / count:.0%}{limits}"
+        limits = interval(low, high) if saw == "one update" else "for any answer"
+        cells[trait] = f"{right / count:.0%} {limits}"
     seen = "the global model" if saw == "the mean of ten" else saw
-    member = found[(found.attack == "member") & (found.saw == seen) & (found.noise == noise)]
-    cells["member (area)"] = _area(member[(member["round"] == 1) & (member.demos == demos)])
+    member = found[(found.attack == "member") & (found.saw == seen) & (found.noise == noise) & (found.demos == demos)]
+    cells["member (area)"] = _area(member[member["round"] == member["round"].max()])
     return cells
 
 
 def _area(rows: pd.DataFrame) -> str:
+    return "{:.2f} [{:.2f}, {:.2f}]".format(*_limits(rows))
+
+
+def _limits(rows: pd.DataFrame) -> tuple[float, float, float]:
+    """The mean area over training seeds, and its interval."""
     middle = _mean_area(rows)
     ends = np.array([separation.auc_interval(*scores) for scores in _by_seed(rows)])
-    half = np.sqrt(np.square(np.diff(ends) / 2).sum()) / len(ends)
-    return f"{middle:.2f} [{max(0, middle - half):.2f}, {min(1, middle + half):.2f}]"
+    half = float(np.sqrt(np.square(np.diff(ends) / 2).sum()) / len(ends))
+    return middle, max(0.0, middle - half), min(1.0, middle + half)
 
 
 def _mean_area(rows: pd.DataFrame) -> float:
@@ -150,9 +171,11 @@ def _mean_area(rows: pd.DataFrame) -> float:
 def _separated(key: tuple[str, int, int, float], rows: pd.DataFrame) -> dict[str, object]:
     each = _by_seed(rows)
     found = np.mean([(inside > outside.max()).mean() for inside, outside in each])
+    chance = np.mean([1 / (len(outside) + 1) for _, outside in each])  # of a rank above all others
     return {"seen": key[0], "demos": int(key[1]), "round": int(key[2]), "noise": key[3],
             "area [95 %]": _area(rows),
-            "found without a false accusation": f"{found:.0%}", "asked": sum(map(len, sum(each, ())))}  # fmt: skip
+            "found without a false accusation": f"{found:.0%}", "by chance": f"{chance:.1%}",
+            "asked": sum(map(len, sum(each, ())))}  # fmt: skip
 
 
 def _by_seed(rows: pd.DataFrame) -> list[tuple[np.ndarray, np.ndarray]]:

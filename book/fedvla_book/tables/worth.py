@@ -41,7 +41,7 @@ def alone_at_best(rows: pd.DataFrame) -> pd.DataFrame:
 
     For each number of demonstrations these are the labs alone that succeeded most on their own task and place, of the
     numbers of steps measured with it; more might help still where that is the largest. The other rows of labs alone are
-    left out. To choose the best favours labs alone a little.
+    left out. Choosing the best slightly favours labs alone.
 
     Args:
         rows: of `results.read_results`.
