@@ -1,5 +1,7 @@
 """The command line: one line and status 2 for bad input, status 130 and a kept recording after Ctrl-C."""
 
+import argparse
+import ctypes
 import json
 import os
 import re
@@ -216,6 +218,30 @@ def test_a_small_run_starts_no_workers_unless_told_to(monkeypatch):
     for words in (["--profile", "tiny"], ["--profile", "tiny", "--jobs", "2"], ["--profile", "laptop"]):
         assert main(["run", *words]) == 0
     assert asked == [1, 2, 3]
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(os.name != "posix", reason="sends a POSIX signal")
+@pytest.mark.parametrize("error", [ctypes.ArgumentError, RuntimeError])
+def test_an_interruption_stays_one_if_the_code_makes_another_error_of_it(error, monkeypatch, capsys):
+    """As ctypes does where it converts an argument."""
+
+    def interrupted(_):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        except KeyboardInterrupt:
+            raise error("argument 1: KeyboardInterrupt") from None
+
+    parser = argparse.ArgumentParser()
+    parser.set_defaults(handler=interrupted, kept="all of it", traceback=False, command="record")
+    monkeypatch.setattr("fedvla_lib.cli.main.build_parser", lambda: parser)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
+    try:
+        assert main([]) == 130 and capsys.readouterr().err == "\ninterrupted: all of it\n"
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.integration

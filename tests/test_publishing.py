@@ -168,7 +168,12 @@ def test_each_workflow_does_what_it_is_for():
     done = {path.stem: [" ".join(words) for words in commands(path)] for path in WORKFLOWS}
     assert done["ci"] == [".ci/run"]
     assert [line for line in done["pages"] if line.startswith("make ")] == ["make address", "make book", "make zip"]
-    assert [line for line in done["release"] if line.startswith("make ")] == ["make book", "make zip", "make pdf"]
+    assert [line for line in done["release"] if line.startswith("make ")] == [
+        "make book",
+        "make zip",
+        "make pdf",
+        "make sbom",
+    ]
     assert "_build/html/laptop" in (ROOT / ".github/workflows/pages.yml").read_text()
 
 

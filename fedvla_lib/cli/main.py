@@ -25,22 +25,30 @@ SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(si
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    options = build_parser().parse_args(argv)
+    options, received = build_parser().parse_args(argv), []
     try:
         _check_counts(options)
-        with _signals_as_ctrl_c():
+        with _signals_as_ctrl_c(received):
             return options.handler(options) or 0
     except KeyboardInterrupt:
-        print(f"\ninterrupted: {options.kept}", file=sys.stderr)
-        return INTERRUPTED
+        return _interrupted(options.kept)
     except EXPECTED as error:
+        if received:  # code that was interrupted may raise an error of its own
+            return _interrupted(options.kept)
         if options.traceback:
             traceback.print_exc()
         return _failed(options.command, error)
     except Exception as error:  # a mistake of ours: the user gets one line all the same, and we get the traceback
+        if received:  # ctypes makes an ArgumentError of it
+            return _interrupted(options.kept)
         with tempfile.NamedTemporaryFile("w", prefix="fedvla-", suffix=".log", delete=False) as log:
             traceback.print_exc(file=log)
         return _failed(options.command, error, f" (this should not happen: the traceback is in {log.name})")
+
+
+def _interrupted(kept: str) -> int:
+    print(f"\ninterrupted: {kept}", file=sys.stderr)
+    return INTERRUPTED
 
 
 def _failed(command: str, error: Exception, beside: str = "") -> int:
@@ -57,14 +65,24 @@ def _check_counts(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _signals_as_ctrl_c() -> Iterator[None]:
-    """Let `SIGNALS` raise KeyboardInterrupt, so that commands stop what they started. Ignored ones (nohup) stay so."""
+def _signals_as_ctrl_c(received: list[int]) -> Iterator[None]:
+    """Let `SIGNALS` raise KeyboardInterrupt, so that commands stop what they started. Ignored ones (nohup) stay so.
+
+    Args:
+        received: gets the number of each signal.
+    """
+
+    def interrupt(number: int, _: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
     on_main_thread = threading.current_thread() is threading.main_thread()  # only there may signals be handled
-    handled = [sign for sign in SIGNALS if on_main_thread and signal.getsignal(sign) is signal.SIG_DFL]
-    for sign in handled:
-        signal.signal(sign, signal.default_int_handler)
+    before = {sign: signal.getsignal(sign) for sign in (*SIGNALS, signal.SIGINT) if on_main_thread}
+    usual = {sign: how for sign, how in before.items() if how in (signal.SIG_DFL, signal.default_int_handler)}
+    for sign in usual:
+        signal.signal(sign, interrupt)
     try:
         yield
     finally:
-        for sign in handled:
-            signal.signal(sign, signal.SIG_DFL)
+        for sign, how in usual.items():
+            signal.signal(sign, how)
