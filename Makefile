@@ -11,7 +11,7 @@
 #
 # Everything is installed in this folder: uv in .uv, the environment in .venv, recordings and downloads in .cache.
 # Settings from the environment: FEDVLA_PROFILE=tiny|laptop|gpu (default laptop), TORCH_BACKEND=cpu|cu128|... (the
-# torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS=3 (processes that
+# torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS (processes that
 # share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS (chapters that
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
 .DEFAULT_GOAL := help
@@ -19,7 +19,7 @@
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
-TEST_WORKERS ?= 3
+TEST_WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)))
 BIN := .venv/bin
 UV := .uv/bin/uv
 LOCK := requirements.lock
