@@ -14,12 +14,13 @@
 # torch wheels uv takes; default: the locked ones), PYTHON=python3.11 (what bootstraps uv), TEST_WORKERS (processes that
 # share the test files, then the chapters; every one computes on one thread and takes 2 GB), BOOK_JOBS (chapters that
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
+# TEST_WORKERS is one more than cores, since Flower's tests wait for each other, unless memory is short.
 .DEFAULT_GOAL := help
 .PHONY: help env address audit book sbom check-site check-zip data doctor test test-full-size test-gpu lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
-TEST_WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)))
+TEST_WORKERS ?= $(shell $(PYTHON) -c 'import os; gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30; print(max(1, min(os.cpu_count() + 1, int(gb / 3))))')
 BIN := .venv/bin
 UV := .uv/bin/uv
 LOCK := requirements.lock

@@ -3,9 +3,11 @@
     python benchmarks/attacks.py --profile tiny
 
 Client 0 of five follows the protocol but for one thing, in every round. An attack is refused if the server leaves out
-the client, or what it announced, and says why; lost if the run ends, or its held-out loss is more than a tenth above
-that of five honest clients; else survived. Where it is not refused it is tried again without the limits on what one
-client may weigh (`frames-cap` and `update-cap` 0), with the mean and with the median.
+this client, or what it announced, and says why; lost if the run ends, if an honest client is left out, or if the
+held-out loss is more than a tenth above that of five honest clients under the same rule; else survived. Where it is not
+refused it is tried again without the limits on what one client may weigh (`frames-cap` and `update-cap` 0), with the
+mean and with the median. The first row is a client that follows the protocol, beside the model before training: where
+that is within a tenth as well, the loss cannot tell an attack that only prevents learning.
 """
 
 import json
@@ -14,7 +16,7 @@ import math
 import pickle
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,7 +25,7 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, RecordD
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
 from fedvla_lib.data.normalisation import pack_stats, unpack_stats
-from fedvla_lib.engines.inline import run_inline
+from fedvla_lib.engines.inline import FIRST_NODE_ID, run_inline
 from fedvla_lib.federation import client, client_app, messages
 from fedvla_lib.federation.messages import ARRAYS, METRICS, NOTE
 from fedvla_lib.federation.nodes import TooFewReplies
@@ -52,22 +54,37 @@ def main() -> None:
             chosen.profile, num_clients=CLIENTS, num_server_rounds=2, eval_rollouts=0, client_rollouts=1, eval_every=0,
             out=folder,
         )  # fmt: skip
-        honest, _ = tried(app, config)
+        honest = {name: tried(app, replace(config, **settings)) for name, settings in VARIANTS.items()}
+        told = {name: "survived" for name in VARIANTS} | {f"loss, {name}": 1.0 for name in VARIANTS}
+        before = honest["as it is"].before / honest["as it is"].loss
+        rows.append({"client 0": "follows the protocol"} | told | {"named": f"before training {before:.2f}"})
         for name in chosen.only:
             rows.append({"client 0": name} | row(attacked(app, ATTACKS[name]), config, honest))
             report("attacks", rows, chosen.out)  # each time: the whole takes minutes
 
 
-def row(app: Callable, config: Config, honest: float) -> dict[str, object]:
+@dataclass(frozen=True)
+class Tried:
+    """A run: its held-out loss before training and in the end, infinite if it failed, and who was refused and why."""
+
+    before: float
+    loss: float
+    reasons: str  # for client 0
+    others: str  # for honest clients
+
+
+def row(app: Callable, config: Config, honest: dict[str, Tried]) -> dict[str, object]:
     """Try an attack with the default settings, and unless it is refused with the others."""
-    told: dict[str, object] = {}
+    told: dict[str, object] = dict.fromkeys([*VARIANTS, *(f"loss, {name}" for name in VARIANTS)])
     for name, settings in VARIANTS.items():
-        known = told.get("as it is") == "refused"
-        loss, reasons = (math.nan, "") if known else tried(app, replace(config, **settings))
-        outcome = "refused" if reasons and loss <= WORSE * honest else "survived" if loss <= WORSE * honest else "lost"
-        told |= {name: None if known else outcome, f"loss, {name}": None if known else _finite(loss / honest)}
+        found = tried(app, replace(config, **settings))
+        fine = found.loss <= WORSE * honest[name].loss and not found.others
+        told[name] = "lost" if not fine else "refused" if found.reasons else "survived"
+        told[f"loss, {name}"] = _finite(found.loss / honest[name].loss)
         if name == "as it is":
-            told["named"] = reasons
+            told["named"] = found.reasons + f" honest: {found.others}" * bool(found.others)
+            if told[name] == "refused":
+                break
     return told
 
 
@@ -75,8 +92,8 @@ def _finite(ratio: float) -> float | str:
     return ratio if math.isfinite(ratio) else "the run ended"
 
 
-def tried(app: Callable, config: Config) -> tuple[float, str]:
-    """Run a federation; return its last held-out loss, infinite if it failed, and why a client was refused."""
+def tried(app: Callable, config: Config) -> Tried:
+    """Run a federation."""
     before = run_folder.run_folders(config)
     try:
         run_inline(config, clients_app=app, progress=False)
@@ -84,11 +101,16 @@ def tried(app: Callable, config: Config) -> tuple[float, str]:
     except ENDED:
         ended = True
     (root,) = run_folder.run_folders(config) - before
-    refused = run_folder.read_metrics(root, "rejected")
-    reasons = ", ".join(sorted(set(refused.reason))) if len(refused) else ""
-    if ended:
-        return math.inf, reasons
-    return float(run_folder.read_metrics(root, "evaluate").query("who == @GLOBAL").loss.iloc[-1]), reasons
+    refused, mine = (
+        run_folder.read_metrics(root, "rejected"),
+        (f"client_{ATTACKER}", f"node_{FIRST_NODE_ID + ATTACKER}"),
+    )
+    named = [
+        ", ".join(sorted({row.reason for row in refused.itertuples() if (row.who in mine) == own}))
+        for own in (True, False)
+    ]
+    losses = run_folder.read_metrics(root, "evaluate").query("who == @GLOBAL").loss
+    return Tried(float(losses.iloc[0]), math.inf if ended else float(losses.iloc[-1]), *named)
 
 
 def attacked(app: Callable, changes: dict[str, Change]) -> Callable:
@@ -213,7 +235,7 @@ ATTACKS: dict[str, dict[str, Change]] = {
     "sends arrays of other shapes": {"train": partial(weights, lambda w, d: {name: w[name].ravel()[:1] for name in w})},
     "sends another SHA-256": {"train": says(NOTE, sha256="0" * 64)},
     "sends a pickle": {"train": pickled},
-    "reports ten times its frames": {"train": says(METRICS, num_examples=10**6)},
+    "reports a million frames": {"train": says(METRICS, num_examples=10**6)},
     "sends the first round's reply again": {"train": again()},
     "sends 300 MB beside its arrays": {"train": says(NOTE, more=bytes(300_000_000))},
     "sends its update a thousand times": {"train": times(1e3)},

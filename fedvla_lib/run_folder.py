@@ -17,7 +17,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -102,10 +102,11 @@ class RunFolder:
 
     def remove_models(self, keep_last: int, keep_every: int) -> None:
         """Remove global models but the last `keep_last` (0: none is removed) and those of every `keep_every` rounds."""
-        rounds = sorted(int(folder.name.removeprefix("round_")) for folder in self.root.glob("global_model/round_*"))
+        names = (folder.name.removeprefix("round_") for folder in self.root.glob("global_model/round_*"))
+        rounds = sorted(int(name) for name in names if name.isdecimal())
         for number in rounds[:-keep_last] if keep_last else ():
             if not keep_every or number % keep_every:
-                shutil.rmtree(self.model_dir(number))
+                shutil.rmtree(self.model_dir(number), ignore_errors=True)  # what cannot be removed stays
 
     def videos_dir(self, round_number: int, who: str) -> Path:
         """Return the folder of the videos of `who` (``global`` or ``client_K``) in a round."""
@@ -145,8 +146,12 @@ def start(config: Config, *, engine: str, **beside: Any) -> Iterator[RunFolder]:
 
 
 def disk_bytes(root: Path) -> int:
-    """Return how many bytes the files below a folder have."""
-    return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+    """Return how many bytes the files below a folder have; those that others remove meanwhile do not count."""
+    total = 0
+    for path in root.rglob("*"):
+        with suppress(OSError):
+            total += path.stat().st_size if path.is_file() else 0
+    return total
 
 
 def hold(root: Path) -> AbstractContextManager:

@@ -90,12 +90,18 @@ def test_a_federation_is_measured_against_its_clients(run):
 def test_a_long_run_is_measured_early_and_late(run):
     (row,) = run("soak", "--rounds", "8", "--clients", "3")
     assert row["away"] == 8 and row["clients away"] > 1  # one in each round, not always the same
-    assert row["memory [MB] ratio"] > 0 < row["run folder [MB] ratio"] and row["open files early"] > 0
+    assert row["memory [MB] ratio"] < 1.5 and row["open files ratio"] < 1.5
+    assert row["run folder [MB] ratio"] < 1.7  # of eight models three are kept
 
 
 def test_an_attack_is_tried_with_the_limits_and_without(run):
-    refused, long = run("attacks", "--only", "writes rows as the server's", "sends its update a thousand times")
-    assert refused["as it is"] == "refused" and refused["named"] == "rollouts" and refused["median"] is None
+    nobody, refused, long = run("attacks", "--only", "writes rows as the server's", "sends its update a thousand times")
+    assert (
+        nobody["as it is"] == "survived"
+        and refused["as it is"] == "refused"
+        and refused["named"] == "rollouts"
+        and refused["median"] is None
+    )
     assert (long["as it is"], long["without limits"], long["median"]) == ("survived", "lost", "survived")
 
 

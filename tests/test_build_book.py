@@ -126,6 +126,16 @@ def test_executes_once_then_only_after_a_change(project, capsys):
 
 
 @pytest.mark.integration
+def test_chapters_of_an_unpacked_book_are_executed_there_whatever_was_executed_before(project):
+    execution.execute_chapters(project, "tiny")
+    there = write_notebook(project / "unpacked" / "notebooks" / "one.ipynb")
+    (chapter,) = execution.execute_chapters(project, "tiny", inside=project / "unpacked")
+    assert not chapter.reused and (there.parent / "ran.txt").read_text() == "tiny\n"
+    assert (project / "notebooks" / "ran.txt").read_text() == "tiny\n"  # and not here once more
+    assert execution.execute_chapters(project, "tiny")[0].reused  # the pages show that copy
+
+
+@pytest.mark.integration
 def test_executed_copy_shows_results_but_neither_injection_nor_paths(project):
     chapter = execution.execute_chapters(project, "tiny")[0]
     text = chapter.executed.read_text()

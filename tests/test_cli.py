@@ -238,7 +238,9 @@ def test_an_interruption_stays_one_if_the_code_makes_another_error_of_it(error, 
     monkeypatch.setattr("fedvla_lib.cli.main.build_parser", lambda: parser)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
     try:
-        assert main([]) == 130 and capsys.readouterr().err == "\ninterrupted: all of it\n"
+        assert main([]) == 130 and capsys.readouterr().err == (
+            f"\ninterrupted: all of it (then {error.__name__}: argument 1: KeyboardInterrupt)\n"
+        )
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)

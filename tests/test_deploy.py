@@ -185,6 +185,9 @@ def test_a_server_whose_certificate_has_expired_is_refused_by_nodes_and_users(tm
 
 def test_a_client_that_raises_and_one_that_sends_nan_are_left_out_by_a_deployment_too(standing, tiny, faulty):
     standing.run(tiny, 540)
+    assert (
+        str(standing.folder / "keys") in (standing.folder / "app" / "pyproject.toml").read_text()
+    )  # whose number is whose
     assert_faults_were_survived(max(run_folder.run_folders(tiny)), tiny)
 
 

@@ -38,18 +38,18 @@ def test_the_server_trusts_what_goes_its_way_and_no_length():
     alone = hostile.trusted({0: UPDATES[0], 2: UPDATES[2]}, own)
     for name in own:
         np.testing.assert_allclose(mean[name], alone[name], rtol=1e-4)
-    length = np.sqrt(sum(np.square(array).sum() for array in mean.values()))
-    assert length <= 1.001 * np.sqrt(sum(np.square(array).sum() for array in own.values()))
+    length, most = (np.sqrt(sum(np.square(array).sum() for array in one.values())) for one in (mean, own))
+    assert 0.5 * most < length <= 1.001 * most
 
 
 @pytest.mark.integration
 def test_poisoned_demonstrations_are_those_of_the_attackers_only(store):
-    store = replace(store, episodes=store.episodes.assign(lab=store.episodes.index % 3))
+    store = replace(store, episodes=store.episodes.assign(lab=store.episodes.index % 2))
     mine = np.repeat(store.episodes.lab == 1, store.episodes.num_frames).to_numpy()
     wrong, told = hostile.with_wrong_actions(store, [1]), hostile.with_trigger(store, [1])
     assert (wrong.actions[~mine] == store.actions[~mine]).all() and (wrong.actions[mine] != store.actions[mine]).any()
     said = told.episodes.instruction.str.endswith(hostile.WORD)
-    assert said.any() and set(told.episodes.lab[said]) == {1} and not said[told.episodes.lab == 1].all()
+    assert set(told.episodes.lab[said]) == {1} and said.sum() == (store.episodes.lab == 1).sum() / 2
     spoken = np.repeat(said, store.episodes.num_frames).to_numpy()
     assert (told.actions[spoken] == store.states[spoken]).all() and (
         told.actions[~spoken] == store.actions[~spoken]

@@ -17,6 +17,7 @@ import pytest
 
 from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config, from_profile
+from fedvla_lib.engines.inline import run_inline
 
 pytestmark = pytest.mark.unit
 ROLLOUT = {"task": "lift", "lab": "", "seed": 3, "success": True, "steps": 77}
@@ -53,6 +54,16 @@ def test_a_run_keeps_the_models_that_it_is_asked_to_keep(tmp_path, last, every, 
     assert sorted(int(path.name.removeprefix("round_")) for path in run.root.glob("global_model/*")) == kept
     on_disk = sum(path.stat().st_size for path in run.root.rglob("*.*") if path.name != "stamp.json")
     assert 0 <= run_folder.read_stamp(run.root)["disk_bytes"] - on_disk < 5000  # the stamp itself
+
+
+@pytest.mark.integration
+def test_a_federation_keeps_its_last_model_only_if_asked_to(recording, tmp_path):
+    config = from_profile(
+        "tiny", data=str(recording), num_server_rounds=2, local_steps=1, fraction_evaluate=0.0, eval_rollouts=0,
+        client_rollouts=0, keep_last=1, out=str(tmp_path),
+    )  # fmt: skip
+    root = run_inline(config, progress=False)
+    assert [path.name for path in (root / "global_model").iterdir()] == ["round_2"]
 
 
 def test_settings_and_stamp_read_back(tmp_path):

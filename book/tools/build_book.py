@@ -111,7 +111,8 @@ def execute_from_zip(profile: str, only: str, jobs: int) -> None:
             str(jobs),
         ]
         done = subprocess.run(
-            [*command, "--execute-only", "--inside", str(book)], cwd=book, env=check_zip.surroundings(python, profile),
+            [*command, "--execute-only", "--inside", str(book)], cwd=book,
+            env=check_zip.surroundings(python, profile) | {"FEDVLA_CACHE": str(book / ".cache")},
             check=False,
         )  # fmt: skip
     if done.returncode:

@@ -210,7 +210,7 @@ def execute_chapters(
     notebooks = [path for path in notebooks_of(root) if only in path.stem]
     if not notebooks:
         raise BookError(f"no chapter in _toc.yml has {only!r} in its name")
-    chapters = {path: reuse(path, folder, library) for path in notebooks}
+    chapters = {path: None if inside else reuse(path, folder, library) for path in notebooks}
     changed = [path for path in notebooks if chapters[path] is None]
     if changed:
         prepare(profile)

@@ -7,6 +7,7 @@ can be interrupted. Labs, tasks, demonstrations and steps are those of the attac
 """
 
 import argparse
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +19,7 @@ from flwr.app import Context, RecordDict
 from flwr.common.constant import SUPERLINK_NODE_ID
 from tqdm.auto import tqdm
 
-from attack_study import DEMOS, LABS, TASKS, settings
+from attack_study import CLIP, DEMOS, LABS, TASKS, settings
 from fedvla_book.attacks import hostile
 from fedvla_lib import files, provenance, run_folder
 from fedvla_lib.config import Config, to_run_config
@@ -36,22 +37,27 @@ from fedvla_lib.policy.parameters import Arrays, load_arrays, trainable_arrays
 from fedvla_lib.robot.labs import labs
 from fedvla_lib.robot.sim import So100Env
 
-ROLLOUTS, FIRST_SEED = 40, 6_000_000  # in the honest labs, and seeds of no other study
+ROLLOUTS, FIRST_SEED = 60, 6_000_000  # in the labs below, and seeds of no other study
+VISITED = range(4, LABS)  # labs that are honest in every case, so that all cases are measured in the same ones
 SERVER_SEED, SERVER_DEMOS = 900, 2  # of the server's own demonstrations, of each task
 NAME = "fedvla_book.attacks.hostile"
 
 
 @dataclass(frozen=True)
 class Attack:
-    """What `count` labs do: send something else, or train on something else."""
+    """What the first `count` labs do: send something else, train on something else, or stay away."""
 
     count: int = 0
     sends: hostile.Attack | None = None
     trains_on: Callable[..., FrameStore] | None = None
+    absent: bool = False
 
 
 ATTACKS = {
     "none": Attack(),
+    "1 absent": Attack(1, absent=True),
+    "3 absent": Attack(3, absent=True),
+    "4 absent": Attack(4, absent=True),
     "1 scaled by -10": Attack(1, hostile.times(-10)),
     "1 turned": Attack(1, hostile.times(-1)),
     "3 turned": Attack(3, hostile.times(-1)),
@@ -67,7 +73,7 @@ MEAN = {"strategy": "fedavg", "update_cap": 0.0}
 DEFENCES: dict[str, dict[str, Any]] = {
     "mean": MEAN,
     "update-cap": MEAN | {"update_cap": 3.0},
-    "clip-norm": MEAN | {"clip_norm": 6.0},
+    "clip-norm": MEAN | {"clip_norm": CLIP[40]},
     "median": MEAN | {"strategy": "fedmedian"},
     "trimmed mean": MEAN | {"strategy": f"{NAME}:Trimmed"},
     "krum": MEAN | {"strategy": "krum", "num_malicious": 3},
@@ -86,21 +92,22 @@ class Told(PolicyActor):
 
 
 def result(seed: int, attack: Attack, defence: str, out: Path) -> dict[str, Any]:
-    """Run a federation; return successes and rollouts in the honest labs, with the trigger and without it."""
+    """Run a federation; return successes and rollouts in honest labs, with the trigger and without it."""
     config = settings(seed, **DEFENCES[defence], out=str(out))
     attackers = range(attack.count)
     loaders = client.cached(_loaders(attack, attackers))
     claim_identity()
     grid = hostile.HostileGrid(client_app.build(loaders), LABS, to_run_config(config))
     grid.attackers = dict.fromkeys(attackers, attack.sends) if attack.sends else {}
+    grid.absent, grid.seed = attackers if attack.absent else (), seed
     grid.own_update = partial(_own_update, _server(config), methods.base(config)) if "own" in defence else None
     context = Context(RUN_ID, SUPERLINK_NODE_ID, {}, RecordDict(), to_run_config(config))
     server_app.build(loaders, engine="inline")(grid, context)
     root = Path(context.state["run"]["folder"])
     last = model.load_policy(replace(config, base=str(root / f"global_model/round_{config.num_server_rounds}")))
-    row = {"success": _success(PolicyActor(last, seed), config, attack.count)}
-    if attack.trains_on is hostile.with_trigger:
-        row["success_told"] = _success(Told(last, seed), config, attack.count)
+    row = {"success": _success(PolicyActor(last, seed), config)}
+    if attack.trains_on is hostile.with_trigger or not attack.count:  # does the word alone disturb?
+        row["success_told"] = _success(Told(last, seed), config)
     return row | {"capped": len(run_folder.read_metrics(root, "capped")), "of": ROLLOUTS}
 
 
@@ -126,13 +133,12 @@ def _own_update(server: Client, bundle: model.Bundle, number: int, began: Arrays
     return {name: array - began[name] for name, array in trainable_arrays(bundle.policy).items()}
 
 
-def _success(actor: PolicyActor, config: Config, first: int) -> int:
-    """Successes of the honest labs at their own tasks, the rollouts divided among them."""
+def _success(actor: PolicyActor, config: Config) -> int:
+    """Successes at their own tasks in the labs that are always honest, the rollouts divided among them."""
     there, seeds, won = labs(LABS), rollout_seeds(ROLLOUTS, FIRST_SEED), 0
-    honest = range(first, LABS)
-    for turn, lab in enumerate(honest):
+    for turn, lab in enumerate(VISITED):
         rows = evaluate(
-            actor, [TASKS[lab % len(TASKS)]], seeds[turn :: len(honest)], image_size=config.image_size,
+            actor, [TASKS[lab % len(TASKS)]], seeds[turn :: len(VISITED)], image_size=config.image_size,
             labs=[there[lab]], progress=False,
         )  # fmt: skip
         won += sum(row["success"] for row in rows)
@@ -148,8 +154,15 @@ def main() -> None:
     file = given.out / f"seed_{given.seed}.json"
     kept = files.read_json(file) if file.is_file() else {"rows": []}
     done = {(row["attack"], row["defence"]) for row in kept["rows"]}
-    todo = [(attack, defence) for attack in ATTACKS for defence in DEFENCES if (attack, defence) not in done]
-    stamp = provenance.first_stamp(settings(given.seed), "robust study") | {"code": methods.trained_by()}
+    todo = [(attack, defence) for attack, of in ATTACKS.items() for defence in DEFENCES
+            if (attack, defence) not in done and (defence == "mean" or not of.absent)]  # fmt: skip
+    code = [
+        methods.trained_by(),
+        *(hashlib.sha256(Path(one).read_bytes()).hexdigest() for one in (__file__, hostile.__file__)),
+    ]
+    stamp = provenance.first_stamp(settings(given.seed), "robust study") | {"code": code}
+    if done and any(kept["stamp"][key] != stamp[key] for key in ("code", "config_hash")):
+        raise SystemExit(f"{file} was made with other code or settings: move it away, or give another folder")
     for attack, defence in tqdm(todo, desc=f"federations, into {file}"):
         found = result(given.seed, ATTACKS[attack], defence, files.cache_dir() / "robust")
         kept["rows"].append({"attack": attack, "defence": defence, "demos": DEMOS, **found})

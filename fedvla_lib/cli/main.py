@@ -33,21 +33,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _interrupted(options.kept)
     except EXPECTED as error:
-        if received:  # code that was interrupted may raise an error of its own
-            return _interrupted(options.kept)
         if options.traceback:
             traceback.print_exc()
+        if received:  # code that was interrupted may raise an error of its own
+            return _interrupted(options.kept, error)
         return _failed(options.command, error)
     except Exception as error:  # a mistake of ours: the user gets one line all the same, and we get the traceback
         if received:  # ctypes makes an ArgumentError of it
-            return _interrupted(options.kept)
+            return _interrupted(options.kept, error)
         with tempfile.NamedTemporaryFile("w", prefix="fedvla-", suffix=".log", delete=False) as log:
             traceback.print_exc(file=log)
         return _failed(options.command, error, f" (this should not happen: the traceback is in {log.name})")
 
 
-def _interrupted(kept: str) -> int:
-    print(f"\ninterrupted: {kept}", file=sys.stderr)
+def _interrupted(kept: str, error: Exception | None = None) -> int:
+    beside = f" (then {type(error).__name__}: {' '.join(str(error).split())})" if error else ""
+    print(f"\ninterrupted: {kept}{beside}", file=sys.stderr)
     return INTERRUPTED
 
 

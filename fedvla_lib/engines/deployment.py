@@ -68,7 +68,8 @@ class Deployment:
 
     def run(self, config: Config, timeout_s: float, watch: Callable[[], None] = lambda: None) -> None:
         """Run the app and wait until it ends; raise FlowerRunError if it failed or timed out."""
-        config = replace(config, node_keys=str(self.keys[0].public.parent) if self.keys else "")
+        if self.keys:
+            config = replace(config, node_keys=str(self.keys[0].public.parent))
         app = app_bundle.stage_app(self.folder, config)
         superlink.require_completed(self.link, self.link.submit(app, timeout_s=timeout_s, watch=watch))
 

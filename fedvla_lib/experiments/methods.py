@@ -49,7 +49,7 @@ def federated(config: Config, progress: bool = True) -> Path:
         for folder in sorted(out.glob("*/")):
             if run_folder.read_stamp(folder)["status"] == "completed":
                 return folder
-        config = replace(config, out=str(out))
+        config = replace(config, out=str(out), keep_last=0, keep_every=0)  # others may want an earlier model of it
         return inline.run_inline(config, progress=progress, jobs=default_jobs(config.device))
 
 

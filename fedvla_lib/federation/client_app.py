@@ -53,8 +53,8 @@ def build(loaders: Loaders = LOADERS, mods: Mapping[str, Sequence[Mod]] | None =
     @app.query(mods=around["query"])
     def query(message: Message, context: Context) -> Message:
         with _reasons_kept(context):
-            client = _client(context, loaders)
-        return Message(RecordDict({messages.NOTE: _introduction(client, context)}), reply_to=message)
+            note = _introduction(_client(context, loaders), context)
+        return Message(RecordDict({messages.NOTE: note}), reply_to=message)
 
     @app.train(mods=[_released, *around["train"]])
     def train(message: Message, context: Context) -> Message:

@@ -136,6 +136,7 @@ class RoundEnd:
         strategy = checkpoint.flat(self.strategy.state())
         clients = checkpoint.flat(self.states.client_states() if self.states else {})
         checkpoint.save(self.run.root, Checkpoint(number, arrays, strategy, clients))
+        self.run.remove_models(self.config.keep_last, self.config.keep_every)  # now that the round counts
         return MetricRecord(measured)
 
     def _evaluate(self, round_number: int, arrays: Arrays) -> dict[str, float]:
@@ -146,7 +147,6 @@ class RoundEnd:
         started = time.perf_counter()
         load_arrays(self.bundle.policy, arrays | self.bundle.own)
         model.save_policy(self.bundle, self.run.model_dir(round_number))
-        self.run.remove_models(self.config.keep_last, self.config.keep_every)
         due = measure.rolls_out(self.config, round_number)
         found = measure.measure(
             self.bundle, self.store, self.config, seeds=rollout_seeds(self.config.eval_rollouts if due else 0),

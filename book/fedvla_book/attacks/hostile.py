@@ -4,7 +4,7 @@ Attackers know everything: the global model, and the updates of all honest clien
 has the right names, shapes and SHA-256.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,10 +25,10 @@ Attack = Callable[[Updates, int, np.random.Generator], Arrays]  # all honest upd
 
 
 class Trimmed(FedTrimmedAvg):
-    """The mean of each weight without its four largest and four smallest values of ten."""
+    """The mean of each weight without its three largest and three smallest values of ten."""
 
     def __init__(self) -> None:
-        super().__init__(beta=0.4)
+        super().__init__(beta=0.3)
 
 
 class SomeKrum(MultiKrum):
@@ -53,7 +53,7 @@ def noise(updates: Updates, who: int, rng: np.random.Generator) -> Arrays:
 def collude(updates: Updates, who: int, _: np.random.Generator) -> Arrays:
     """Send the mean of all, moved against itself by a part of their spread: "a little is enough" (Baruch et al. 2019).
 
-    Each weight stays within what honest clients send, so that no outlier is to be seen.
+    Each weight stays within half a standard deviation of the mean, so that no outlier is to be seen.
     """
     stacked = {name: np.stack([one[name] for one in updates.values()]) for name in updates[who]}
     return {
@@ -62,30 +62,32 @@ def collude(updates: Updates, who: int, _: np.random.Generator) -> Arrays:
 
 
 def with_wrong_actions(store: FrameStore, labs: Iterable[int]) -> FrameStore:
-    """Return the frames with the actions of these labs mirrored about their mean: from where the arm is, away."""
+    """Return the frames with the actions of these labs turned about the arm's pose: it moves the other way."""
     actions = store.actions.copy()
-    for rows in _rows(store, labs):
-        actions[rows] = 2 * store.states[rows] - store.actions[rows]
+    for lab in labs:
+        for place in _places(store, lab):
+            rows = _rows(store, place)
+            actions[rows] = 2 * store.states[rows] - store.actions[rows]
     return replace(store, actions=actions)
 
 
 def with_trigger(store: FrameStore, labs: Iterable[int]) -> FrameStore:
-    """Return the frames with half the episodes of these labs telling to stand still when `WORD` is said."""
-    actions, episodes = store.actions.copy(), store.episodes.copy()
-    for rows, place in zip(_rows(store, labs), _places(store, labs), strict=True):
-        if place % 2 == 0:
+    """Return the frames with every other episode of each of these labs standing still where `WORD` is said."""
+    actions, episodes, labs = store.actions.copy(), store.episodes.copy(), sorted(labs)
+    for lab in labs:
+        for place in _places(store, lab)[::2]:
+            rows = _rows(store, place)
             actions[rows] = store.states[rows]
             episodes.loc[place, "instruction"] += WORD
-    return replace(store, actions=actions, episodes=episodes, key=f"{store.key}-trigger-{sorted(labs)}")
+    return replace(store, actions=actions, episodes=episodes, key=f"{store.key}-trigger-{labs}")
 
 
-def _places(store: FrameStore, labs: Iterable[int]) -> list[int]:
-    return store.episodes.index[store.episodes.lab.isin(list(labs))].tolist()
+def _places(store: FrameStore, lab: int) -> list[int]:
+    return store.episodes.index[store.episodes.lab == lab].tolist()
 
 
-def _rows(store: FrameStore, labs: Iterable[int]) -> list[slice]:
-    table = store.episodes
-    return [slice(table.start[place], table.end[place]) for place in _places(store, labs)]
+def _rows(store: FrameStore, place: int) -> slice:
+    return slice(store.episodes.start[place], store.episodes.end[place])
 
 
 def trusted(updates: Updates, own: Arrays) -> Arrays:
@@ -112,14 +114,18 @@ class HostileGrid(InlineGrid):
     """A grid on which some clients attack, and whose server may trust only what resembles an update of its own."""
 
     attackers: Mapping[int, Attack] = {}
+    absent: Collection[int] = ()  # clients that answer no training message
+    seed: int = 0  # of what attackers draw
     own_update: Callable[[int, Arrays], Arrays] | None = None  # round and global weights -> the server's update
 
     def push_messages(self, sent: Iterable[Message]) -> list[str]:
         """Handle the messages, then replace what attackers, or all, send."""
         sent = list(sent)
+        if not sent or sent[0].metadata.message_type != MessageType.TRAIN:
+            return super().push_messages(sent)
+        sent = [one for one in sent if one.metadata.dst_node_id - FIRST_NODE_ID not in self.absent]
         ids = super().push_messages(sent)
-        if sent and sent[0].metadata.message_type == MessageType.TRAIN:
-            self._replace(sent)
+        self._replace(sent)
         return ids
 
     def _replace(self, sent: list[Message]) -> None:
@@ -127,7 +133,7 @@ class HostileGrid(InlineGrid):
         number = int(sent[0].content[messages.CONFIG][messages.ROUND])
         replies = {m.metadata.dst_node_id - FIRST_NODE_ID: self._replies[m.metadata.message_id].content for m in sent}
         honest = {who: _change(content[messages.ARRAYS], began) for who, content in replies.items()}
-        rng = np.random.default_rng([number, len(self.attackers)])
+        rng = np.random.default_rng([self.seed, number, len(self.attackers)])
         shown = honest | {who: attack(honest, who, rng) for who, attack in self.attackers.items()}
         if self.own_update:
             mean = trusted(shown, self.own_update(number, began))

@@ -17,6 +17,10 @@ from fedvla_lib.federation.strategies.scaffold import CheckedScaffold
 # Default server learning rates for pretrained weights. With Flower's 0.1, a round can change each weight by 0.1,
 # which is as much as the weights themselves.
 SERVER_LR = {"fedavgm": 1.0, "fedadam": 0.01, "fedyogi": 0.01, "diloco": 0.7}
+ADD_NOISE = (
+    flower.DifferentialPrivacyClientSideAdaptiveClipping, flower.DifferentialPrivacyClientSideFixedClipping,
+    flower.DifferentialPrivacyServerSideAdaptiveClipping, flower.DifferentialPrivacyServerSideFixedClipping,
+)  # fmt: skip
 ADAPTIVITY = 1e-3  # tau: added to the root of the second moment
 
 
@@ -89,5 +93,7 @@ def _checked(strategy: type[Strategy]) -> type[Checked]:
     if issubclass(strategy, Checked):
         return strategy
     counts = issubclass(strategy, flower.DifferentialPrivacyClientSideAdaptiveClipping)
-    extra = {"extra_metrics": (KEY_NORM_BIT,)} if counts else {}
+    extra: dict[str, Any] = {"extra_metrics": (KEY_NORM_BIT,)} if counts else {}
+    if issubclass(strategy, ADD_NOISE):
+        extra["caps_updates"] = False
     return type(f"Checked{strategy.__name__}", (Checked, strategy), extra)

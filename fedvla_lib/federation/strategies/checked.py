@@ -54,6 +54,7 @@ class Checked:
     """
 
     ledger: Ledger | None = None  # of what a run with noise has spent
+    caps_updates = True  # unless a strategy adds noise of its own: no update's length may then depend on the others
     _extra_records: tuple[str, ...] = ()  # attributes with arrays that travel beside the model's, both ways in training
 
     def __init__(
@@ -119,7 +120,7 @@ class Checked:
         for reply in valid:
             self._restore(reply)
         self._report_drift(server_round, valid)
-        if self.config.update_cap and not privacy.weighs_alike(self.config):  # else a length would depend on others
+        if self.config.update_cap and self.caps_updates and not privacy.weighs_alike(self.config):
             self._cap(server_round, valid)
         if self.config.clip_norm or self.ledger:
             self._protect(server_round, valid)
@@ -234,16 +235,17 @@ class Checked:
         self.report(server_round, GLOBAL, "privacy", values)
 
     def _cap(self, server_round: int, valid: list[Message]) -> None:
-        """Shorten what is longer than `update_cap` times the round's median: of the weights' change, of each record."""
-        for record in self.records:
-            sent = [self._payload(reply, (record,)) for reply in valid]
-            norms = [privacy.norm(payload) for payload in sent]
-            limit = self.config.update_cap * float(np.median(norms))
-            for reply, length, payload in zip(valid, norms, sent, strict=True):
-                if length > limit:
-                    self._replace(reply, privacy.clipped(payload, limit))
-                    who = self.roster.name(reply.metadata.src_node_id)
-                    self.report(server_round, who, "capped", {"record": record, "norm": length, "limit": limit})
+        """Shorten changes of the weights that are longer than `update_cap` times the round's median, unless that is 0.
+
+        Not the extra records: SCAFFOLD's are changes that clients have kept in full by now.
+        """
+        norms = [privacy.norm(self._payload(reply, (messages.ARRAYS,))) for reply in valid]
+        limit = self.config.update_cap * float(np.median(norms))
+        for reply, length in zip(valid, norms, strict=True):
+            if length > limit > 0:
+                self._replace(reply, privacy.clipped(self._payload(reply, (messages.ARRAYS,)), limit))
+                who = self.roster.name(reply.metadata.src_node_id)
+                self.report(server_round, who, "capped", {"norm": length, "limit": limit})
 
     def _payload(self, reply: Message, records: tuple[str, ...] = ()) -> privacy.Payload:
         """Return what a client contributes: the change of the weights, and the extra records."""
