@@ -22,6 +22,7 @@ from functools import partial
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, RecordDict
 
+from fedvla_book.attacks import hostile
 from fedvla_lib import run_folder
 from fedvla_lib.config import Config
 from fedvla_lib.data.normalisation import pack_stats, unpack_stats
@@ -29,7 +30,7 @@ from fedvla_lib.engines.inline import FIRST_NODE_ID, run_inline
 from fedvla_lib.federation import client, client_app, messages
 from fedvla_lib.federation.messages import ARRAYS, METRICS, NOTE
 from fedvla_lib.federation.nodes import TooFewReplies
-from fedvla_lib.policy.parameters import Arrays, digest
+from fedvla_lib.policy.parameters import Arrays
 from fedvla_lib.run_folder import GLOBAL
 from report import laptop, options, report, start
 
@@ -103,7 +104,7 @@ def tried(app: Callable, config: Config) -> Tried:
     (root,) = run_folder.run_folders(config) - before
     refused, mine = (
         run_folder.read_metrics(root, "rejected"),
-        (f"client_{ATTACKER}", f"node_{FIRST_NODE_ID + ATTACKER}"),
+        {f"client_{ATTACKER}", f"node_{FIRST_NODE_ID + ATTACKER}"},
     )
     named = [
         ", ".join(sorted({row.reason for row in refused.itertuples() if (row.who in mine) == own}))
@@ -158,7 +159,7 @@ def weights(of: Callable[[Arrays, Arrays], Arrays], content: RecordDict, message
     """Send what a function makes of the global weights and the update, with its SHA-256."""
     began, ended = (messages.unpack_arrays(record[ARRAYS]) for record in (message.content, content))
     sent = of(began, {name: ended[name] - began[name] for name in began})
-    content[ARRAYS], content[NOTE][messages.DIGEST] = messages.pack_arrays(sent), digest(sent)
+    hostile.send(content, sent)
 
 
 def times(factor: float) -> Change:
@@ -168,10 +169,8 @@ def times(factor: float) -> Change:
 
 def noise(began: Arrays, update: Arrays) -> Arrays:
     """Return noise as long as the update, in each array, in its place."""
-    rng = np.random.default_rng(0)
-    drawn = {name: rng.normal(size=np.shape(change)) for name, change in update.items()}
-    scales = {name: np.linalg.norm(update[name]) / np.linalg.norm(drawn[name]) for name in drawn}
-    return {name: (began[name] + scales[name] * drawn[name]).astype(np.float32) for name in began}
+    change = hostile.noise_like(update, 1.0, np.random.default_rng(0))
+    return {name: began[name] + change[name] for name in began}
 
 
 def pickled(content: RecordDict, _: Message) -> None:

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from flwr.app import Context, RecordDict
 from flwr.common.constant import SUPERLINK_NODE_ID
 from tqdm.auto import tqdm
@@ -170,5 +169,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    np.seterr(over="ignore")
     main()

@@ -6,10 +6,9 @@ has the right names, shapes and SHA-256.
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from flwr.app import Message, MessageType
+from flwr.app import ArrayRecord, Message, MessageType, RecordDict
 from flwr.serverapp.strategy import FedTrimmedAvg, MultiKrum
 
 from fedvla_lib.data.frame_store import FrameStore
@@ -45,9 +44,14 @@ def times(factor: float) -> Attack:
 
 def noise(updates: Updates, who: int, rng: np.random.Generator) -> Arrays:
     """Send noise ten times as long as the honest update, array by array."""
-    drawn = {name: rng.normal(size=np.shape(change)) for name, change in updates[who].items()}
-    lengths = {name: np.linalg.norm(updates[who][name]) / np.linalg.norm(drawn[name]) for name in drawn}
-    return {name: (10 * lengths[name] * value).astype(np.float32) for name, value in drawn.items()}
+    return noise_like(updates[who], 10.0, rng)
+
+
+def noise_like(update: Arrays, times_as_long: float, rng: np.random.Generator) -> Arrays:
+    """Return noise whose arrays are so many times as long as those of an update."""
+    drawn = {name: rng.normal(size=np.shape(change)) for name, change in update.items()}
+    scales = {name: times_as_long * np.linalg.norm(update[name]) / np.linalg.norm(drawn[name]) for name in drawn}
+    return {name: (scales[name] * value).astype(np.float32) for name, value in drawn.items()}
 
 
 def collude(updates: Updates, who: int, _: np.random.Generator) -> Arrays:
@@ -140,13 +144,14 @@ class HostileGrid(InlineGrid):
             shown = dict.fromkeys(shown, mean)
         for who, change in shown.items():
             if change is not honest[who]:
-                _resign(replies[who], {name: began[name] + change[name] for name in began})
+                send(replies[who], {name: began[name] + change[name] for name in began})
 
 
-def _change(record: Any, began: Arrays) -> Arrays:
+def _change(record: ArrayRecord, began: Arrays) -> Arrays:
     return {name: array - began[name] for name, array in messages.unpack_arrays(record).items()}
 
 
-def _resign(content: Any, arrays: Arrays) -> None:
+def send(content: RecordDict, arrays: Arrays) -> None:
+    """Put other weights into a training reply, with their SHA-256."""
     content[messages.ARRAYS] = messages.pack_arrays(arrays)
     content[messages.NOTE][messages.DIGEST] = digest(arrays)

@@ -239,26 +239,25 @@ class Checked:
 
         Not the extra records: SCAFFOLD's are changes that clients have kept in full by now.
         """
-        norms = [privacy.norm(self._payload(reply, (messages.ARRAYS,))) for reply in valid]
+        norms = [privacy.norm(self._payload(reply)) for reply in valid]
         limit = self.config.update_cap * float(np.median(norms))
         for reply, length in zip(valid, norms, strict=True):
             if length > limit > 0:
-                self._replace(reply, privacy.clipped(self._payload(reply, (messages.ARRAYS,)), limit))
+                self._replace(reply, privacy.clipped(self._payload(reply), limit))
                 who = self.roster.name(reply.metadata.src_node_id)
                 self.report(server_round, who, "capped", {"norm": length, "limit": limit})
 
-    def _payload(self, reply: Message, records: tuple[str, ...] = ()) -> privacy.Payload:
+    def _payload(self, reply: Message) -> privacy.Payload:
         """Return what a client contributes: the change of the weights, and the extra records."""
-        together = records or (self.records if privacy.weighs_alike(self.config) else (messages.ARRAYS,))
+        together = self.records if privacy.weighs_alike(self.config) else (messages.ARRAYS,)
         content = {name: messages.unpack_arrays(reply.content[name]) for name in together}
-        if ends := content.get(messages.ARRAYS):
-            content[messages.ARRAYS] = {name: array - self._global[name] for name, array in ends.items()}
-        return content
+        changes = {name: array - self._global[name] for name, array in content[messages.ARRAYS].items()}
+        return content | {messages.ARRAYS: changes}
 
     def _replace(self, reply: Message, payload: privacy.Payload) -> None:
-        for record, arrays in payload.items():
-            ends = {name: self._global[name] + change for name, change in arrays.items()}
-            reply.content[record] = messages.pack_arrays(ends if record == messages.ARRAYS else arrays)
+        ends = {name: self._global[name] + change for name, change in payload[messages.ARRAYS].items()}
+        for record, arrays in (payload | {messages.ARRAYS: ends}).items():
+            reply.content[record] = messages.pack_arrays(arrays)
 
     def _report_drift(self, server_round: int, valid: list[Message]) -> None:
         """Report how far the clients' weights are apart, unless only their mean is known."""
