@@ -41,8 +41,8 @@ def test_expert_succeeds_on_a_handful_of_seeds(task):
 
 @pytest.mark.slow
 @pytest.mark.no_cover  # counting takes time in loops like this, and the handful of seeds runs the same lines
-def test_expert_succeeds_on_two_hundred_fresh_seeds(task):
-    rows = expert_success(task, range(50_000, 50_200))
+def test_expert_succeeds_on_a_hundred_fresh_seeds(task):
+    rows = expert_success(task, range(50_000, 50_100))
     assert np.mean([row["success"] for row in rows]) >= 0.98, [row["seed"] for row in rows if not row["success"]]
 
 

@@ -376,7 +376,7 @@ def last_weights(config):
 
 
 def test_every_strategy_trains_the_robot_policy_and_fedprox_without_weight_is_fedavg(tiny):
-    config = replace(tiny, num_clients=2, num_malicious=0, **NO_ROLLOUTS)
+    config = replace(tiny, num_clients=2, num_malicious=0, fraction_evaluate=0.0, **NO_ROLLOUTS)
     weights = {name: last_weights(replace(config, strategy=name, proximal_mu=0.0)) for name in STRATEGIES}
     assert same(weights["fedprox"], weights["fedavg"])
     different = [name for name in STRATEGIES if name != "fedprox"]

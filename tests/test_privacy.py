@@ -115,8 +115,8 @@ def test_clipping_counts_all_records_of_a_payload_together_and_leaves_a_client_t
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_adaptive_clipping_finds_a_quantile(tmp_path, noise):
-    lengths = np.exp(np.random.default_rng(1).normal(size=200))
-    updates = directions(200, lengths, size=4)
+    lengths = np.exp(np.random.default_rng(1).normal(size=80))
+    updates = directions(80, lengths, size=4)
     settings = {"clip_norm": 0.1, "clip_quantile": 0.7, "noise": noise, "normalisation": "none"}
     _, events = served(tmp_path, updates, rounds=60, **settings)
     limits = [event["clip_norm"] for event in events]

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.integration
 PLAN = """
 profile = "tiny"
 seeds = [0, 1]
-rollouts = 2
+rollouts = 1
 [settings]
 tasks = "lift,push"
 data = {data!r}
@@ -61,10 +61,10 @@ def test_rollouts_of_an_evaluation(store, tmp_path, monkeypatch):
     tables = []
     for jobs in (1, 2):
         seeds, options = rollouts.rollout_seeds(rollouts.AT_ONCE + 2), {"image_size": 64, "progress": False}
-        found = rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds, jobs=jobs, **options)
+        found = rollouts.evaluate(PolicyActor(bundle), ["push"], seeds, jobs=jobs, **options)
         tables.append(pd.DataFrame(found))
     pd.testing.assert_frame_equal(*tables)
-    videos = rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds[:2], videos_dir=tmp_path, jobs=2, **options)
+    videos = rollouts.evaluate(PolicyActor(bundle), ["lift", "push"], seeds[:1], videos_dir=tmp_path, jobs=2, **options)
     assert all(Path(row["video"]).is_file() for row in videos)
 
 

@@ -86,11 +86,11 @@ def test_labs_alone_are_taken_at_the_number_of_steps_that_served_them_best_in_th
 
 @pytest.mark.slow
 def test_the_interval_of_five_training_seeds_covers_the_truth_as_often_as_it_says():
-    """In 300 simulated experiments of the size of the book's: about 94 and 96 times of a hundred."""
+    """In 200 simulated experiments of the size of the book's: about 94 and 96 times of a hundred."""
     alone = norm.cdf([CENTRES["alone", count] for count in COUNTS])
     truth = [demonstrations_to_match(COUNTS, alone, rate) for rate in norm.cdf([0.05, 0.4])]
     covered = []
-    for k in range(300):
+    for k in range(200):
         found = worth(simulated(np.random.default_rng(k), CENTRES), "federated", "alone", seed=k, resamples=500)
         covered.append((found.low <= truth) & (truth <= found.high))
     rates = np.mean(covered, axis=0)

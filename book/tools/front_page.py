@@ -62,7 +62,7 @@ def headline(rows: pd.DataFrame) -> str:
     planned, fair = rows[rows.place == results.OWN], alone_at_best(rows)
     home, away = (fair[fair.place == place] for place in (results.OWN, "unseen"))
     labs, tasks = home.lab.nunique(), home.task.nunique()
-    statements = (_main(planned), _away(away), _pooled(home), _paid(planned, labs), _open(rows, fair, labs))
+    statements = (main_comparison(planned), _away(away), behind(home), _paid(planned, labs), _open(rows, fair, labs))
     return "\n".join([
         f"**Is it worth federating?** {labs} labs, one of {tasks} tasks in each; nano model, simulation.\n",
         _outcome_figure(), "", gain(home),
@@ -114,7 +114,8 @@ def _worth(row: pd.Series, most: float) -> str:
     return f"{needed} [{low}, {high}]"
 
 
-def _main(home: pd.DataFrame) -> str:
+def main_comparison(home: pd.DataFrame) -> str:
+    """Who is ahead in the comparison that was planned."""
     found = _differences(home[home.demonstrations.isin(MAIN)], FEDERATED, LONE)
     rates = results.summary(home, BY).set_index(["demonstrations", "method"])
     said = [
@@ -135,8 +136,8 @@ def _away(away: pd.DataFrame) -> str:
     return f"In an eleventh lab, where nobody recorded, the federation compared with a lab alone: {'; '.join(said)}."
 
 
-def _pooled(home: pd.DataFrame) -> str:
-    """Where the federation falls behind."""
+def behind(home: pd.DataFrame) -> str:
+    """Where the federation falls behind pooled training and labs alone; `home` is of `alone_at_best`."""
     both = tables.differences(home, [(FEDERATED, POOLED), (FEDERATED, ALONE)], seed=0)
     found = dict(list(both.groupby("other")))
     behind = {

@@ -7,7 +7,6 @@ from typing import Any
 
 from flwr.app import Message
 from flwr.serverapp import Grid
-from flwr.superlink.grid import HttpGrid, InMemoryGrid
 
 # For each client the simulation runtime scans all messages that it holds: n * n for n clients, which with 1,000 clients
 # takes longer than their work.
@@ -18,9 +17,13 @@ HTTP_INTERVAL_S = 0.25  # in a deployment, where Flower would wait for 3 s; a re
 
 def for_runtime(grid: Grid) -> "Grid | ThrottledGrid":
     """Return `grid`; throttled if it is that of Flower's simulation runtime, unlimited if that of a deployment."""
-    if isinstance(grid, HttpGrid):
+    # Not imported: that loads SQLAlchemy, which takes a second in every process. A grid of its classes has it loaded.
+    runtimes = sys.modules.get("flwr.superlink.grid")
+    if runtimes is None or not isinstance(grid, (runtimes.HttpGrid, runtimes.InMemoryGrid)):
+        return grid
+    if isinstance(grid, runtimes.HttpGrid):
         return ThrottledGrid(grid, sys.maxsize, HTTP_INTERVAL_S)
-    return ThrottledGrid(grid, MESSAGES_AT_ONCE) if isinstance(grid, InMemoryGrid) else grid
+    return ThrottledGrid(grid, MESSAGES_AT_ONCE)
 
 
 class ThrottledGrid:
