@@ -63,7 +63,8 @@ def own(policy, stored, real, noisy, times):
 
 
 def lean(policy, *arguments):
-    return lean_expert.velocity(policy, *arguments, width=6)
+    stored, real, noisy, times = arguments
+    return lean_expert.velocity(policy, lean_expert.prepared(policy, stored, real), noisy, times, width=6)
 
 
 def loss_and_gradients(compute, policy):

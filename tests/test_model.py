@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 from fedvla_book import tables
 from fedvla_lib.config import from_profile, granted_cores
 from fedvla_lib.policy import model
-from fedvla_lib.policy.actor import PolicyActor
-from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY
+from fedvla_lib.policy.actor import PolicyActor, starting_noise
+from fedvla_lib.robot.spec import ACTION_KEY, CAMERAS, STATE_KEY, image_key
 
 CONFIG = from_profile("tiny", base="nano-random", num_threads=1)
 STATS = {key: {"mean": np.arange(6.0), "std": np.full(6, 5.0)} for key in (STATE_KEY, ACTION_KEY)}
@@ -64,6 +64,26 @@ def test_driving_depends_on_seed_and_instruction_only():
     np.testing.assert_array_equal(first, drive(bundle))
     assert not np.array_equal(first, drive(bundle, episode=8))
     assert not np.array_equal(first, drive(bundle, scene=SimpleNamespace(instruction="Push the blue cube.")))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("settings", [{}, {"train_expert_only": False}, {"lora_rank": 2}], ids=str)
+def test_the_arm_is_told_what_lerobots_own_prediction_says(settings):
+    """For several observations at once, whose instructions are of several lengths."""
+    bundle = model.load_policy(replace(CONFIG, **settings), STATS)
+    scenes = [SCENE, SimpleNamespace(instruction="Push the blue cube into the circle beside the red square.")]
+    actors, seen = [PolicyActor(bundle) for _ in scenes], [observation(1), observation(2)]
+    for actor, scene in zip(actors, scenes, strict=True):
+        actor.reset(scene, 3)
+    generators = [torch.Generator().set_state(actor._generator.get_state()) for actor in actors]
+    noise = torch.cat([starting_noise(bundle, 1, generator) for generator in generators])
+    raw = {image_key(name): torch.from_numpy(np.stack([each["pixels"][name] for each in seen])) for name in CAMERAS}
+    images = {key: pixels.permute(0, 3, 1, 2) / 255 for key, pixels in raw.items()}
+    states = torch.from_numpy(np.stack([each["agent_pos"] for each in seen]))
+    batch = images | {STATE_KEY: states, "task": [scene.instruction for scene in scenes]}
+    wanted = bundle.postprocess(bundle.policy.predict_action_chunk(bundle.preprocess(batch), noise=noise))
+    found = PolicyActor.act_together(actors, seen)
+    np.testing.assert_allclose(found, wanted[:, 0], atol=1e-4)
 
 
 @pytest.mark.unit

@@ -39,7 +39,7 @@ def tiny(recording, tmp_path):
 
 
 def start_until(python, config, round_number, engine_name="inline", written="checkpoints/round_{}"):
-    """Start a run in a process of a Python and wait until clients train in a round; return the process and the run folder.
+    """Start a run with a Python and wait until clients train in a round; return the process and the run folder.
 
     With `written` until the round before has written that.
     """
@@ -130,7 +130,9 @@ def assert_same_bits(left, right):
     ],
     ids=["full disk", "killed", "interrupted", "damaged", "killed with adaptive clipping and noise"],
 )
-def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(tiny, settings, start_and_end, warm_python, caplog):
+def test_a_run_that_did_not_end_is_resumed_and_ends_in_the_same_bits(
+    tiny, settings, start_and_end, warm_python, caplog
+):
     config = replace(tiny, **settings)
     whole = inline.run_inline(config, progress=False)
     root = start_and_end(warm_python, replace(config, out=config.out + "_ended"), 3)

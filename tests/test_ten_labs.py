@@ -43,7 +43,7 @@ def test_every_seed_of_an_experiment_has_its_own_recording():
 GRID = """
 profile = "tiny"
 seeds = [0]
-rollouts = 8
+rollouts = 16
 [settings]
 %s
 [partitions.lab]
@@ -74,10 +74,10 @@ def rollouts(grid, method):
 def test_a_global_model_is_measured_at_every_lab_s_task_at_home_and_in_the_unseen_lab(grid, method):
     rows, there = rollouts(grid, method), labs(5)
     own, unseen = rows[rows.place == "own"], rows[rows.place == "unseen"]
-    assert len(own) == len(unseen) == 8 and len(rows) == 16
-    assert Counter(own.lab) == {lab.name: 2 for lab in there[:4]} and set(unseen.lab) == {there[4].name}
+    assert len(own) == len(unseen) == 16 and len(rows) == 32
+    assert Counter(own.lab) == {lab.name: 4 for lab in there[:4]} and set(unseen.lab) == {there[4].name}
     task = {lab.name: TASKS.split(",")[k % 2] for k, lab in enumerate(there)}
-    assert (own.lab.map(task) == own.task).all() and Counter(unseen.task) == {"square": 4, "tower": 4}
+    assert (own.lab.map(task) == own.task).all() and Counter(unseen.task) == {"square": 8, "tower": 8}
 
 
 def test_a_lab_alone_is_measured_on_the_same_rollouts_and_at_the_others_tasks(grid):
@@ -87,7 +87,7 @@ def test_a_lab_alone_is_measured_on_the_same_rollouts_and_at_the_others_tasks(gr
             set(zip(of.task, of.lab, of.seed, strict=True))
             for of in (alone[alone.place == place], pooled[pooled.place == place])
         ]
-        assert made[0] == made[1] and len(made[0]) == 8
+        assert made[0] == made[1] and len(made[0]) == 16
     others = alone[alone.place == "others"]
     assert Counter(others.client) == dict.fromkeys(range(4), 1)
     for row in others.itertuples():
@@ -98,7 +98,7 @@ def test_the_book_reads_demonstrations_place_and_time(grid):
     rows = read_results(grid / "out")
     assert set(rows.demonstrations) == {2} and set(rows.place) == {"own", "unseen", "others"}
     found = summary(rows, ["partition", "method", "place"]).set_index(["method", "place"])
-    assert found.rollouts[("alone", "own")] == found.rollouts[("pooled", "unseen")] == 8
+    assert found.rollouts[("alone", "own")] == found.rollouts[("pooled", "unseen")] == 16
     assert (found.in_a_row_s > 0).all() and (found.in_a_row_s <= found.train_s).all()
 
 
@@ -128,7 +128,7 @@ def test_steps_and_times_are_counted(grid):
     ("before", "after", "named"),
     [
         ("alone_steps = 5", "alone_steps = 6", "alone-steps=5, not 6"),
-        ("rollouts = 8", "rollouts = 12", "rollout-seeds="),
+        ("rollouts = 16", "rollouts = 20", "rollout-seeds="),
         ('kind = "local-only"', 'kind = "base"', "kind='local-only', not 'base'"),
     ],
 )

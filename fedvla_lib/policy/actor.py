@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from fedvla_lib.data.augmentation import to_float
+from fedvla_lib.policy import prefix_cache
 from fedvla_lib.policy.model import Bundle
-from fedvla_lib.robot.spec import ACTION_KEY, STATE_KEY, Observation, image_key
+from fedvla_lib.robot.spec import STATE_KEY, Observation, image_key
 
 
 class PolicyActor:
@@ -52,10 +53,11 @@ def starting_noise(bundle: Bundle, count: int, generator: torch.Generator) -> to
     return torch.randn((count, config.chunk_size, config.max_action_dim), generator=generator).to(config.device)
 
 
+@torch.no_grad()
 def _denoise(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor) -> torch.Tensor:
-    inputs = {key: value for key, value in batch.items() if key not in (ACTION_KEY, "action_is_pad")}
-    chunk = bundle.policy.predict_action_chunk(bundle.preprocess(inputs), noise=noise)  # (B, chunk, 6) normalised
-    return bundle.postprocess(chunk)
+    """Return action chunks, (B, chunk, 6) in degrees: `predict_action_chunk` with fewer operations."""
+    bundle.policy.eval()
+    return prefix_cache.denoise(bundle, prefix_cache.prefill(bundle, batch), noise)
 
 
 def _as_batch(observations: Sequence[Observation], instructions: list[str]) -> dict[str, Any]:

@@ -44,12 +44,36 @@ def refusal(policy: SmolVLAPolicy) -> str:
     return "" if kinds == {torch.float32} else f"parameters in {', '.join(sorted(map(str, kinds)))}"
 
 
-def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor, times: Tensor, width: int) -> Tensor:
-    """Return the flow's velocity at noisy action chunks, as `SmolVLAPolicy.model.denoise_step` does.
+def prepared(policy: SmolVLAPolicy, stored: Tensor, real: Tensor) -> list[tuple[_Shared, Tensor]]:
+    """Return what does not depend on actions: for each layer its tables, and the keys and values of the prefixes.
 
     Args:
         stored: keys and values of the prefixes, float32 (B, layers, 2, kv heads, L, head dim).
         real: bool (B, L), False where the instruction is padded.
+    """
+    vlm, chunk = policy.model.vlm_with_expert, policy.config.chunk_size
+    to_self, to_prefix = _tables(real, chunk, stored.shape[3], vlm.num_attention_heads, stored.shape[-1])
+    prefixes = [stored[:, index].transpose(0, 1) for index in range(stored.shape[1])]
+    return [
+        (to_self, prefix) if _is_self(policy, index) else (to_prefix, _projected(prefix, layer.self_attn))
+        for index, (layer, prefix) in enumerate(zip(vlm.lm_expert.layers, prefixes, strict=True))
+    ]
+
+
+def _is_self(policy: SmolVLAPolicy, index: int) -> bool:
+    """Return whether a layer attends to the chunk too, and not to the prefix only."""
+    vlm = policy.model.vlm_with_expert
+    every = vlm.self_attn_every_n_layers
+    return "cross" not in vlm.attention_mode or (every > 0 and index % every == 0)
+
+
+def velocity(
+    policy: SmolVLAPolicy, layers: list[tuple[_Shared, Tensor]], noisy: Tensor, times: Tensor, width: int
+) -> Tensor:
+    """Return the flow's velocity at noisy action chunks, as `SmolVLAPolicy.model.denoise_step` does.
+
+    Args:
+        layers: from `prepared`, for these samples.
         noisy: float32 (B, chunk, max_action_dim).
         times: float32 (B,), in (0, 1].
         width: action dimensions wanted, the first of max_action_dim.
@@ -57,17 +81,11 @@ def velocity(policy: SmolVLAPolicy, stored: Tensor, real: Tensor, noisy: Tensor,
     Returns:
         float32 (B, chunk, width).
     """
-    model, vlm, expert = policy.model, policy.model.vlm_with_expert, policy.model.vlm_with_expert.lm_expert
-    to_self, to_prefix = _tables(real, noisy.shape[1], stored.shape[3], vlm.num_attention_heads, stored.shape[-1])
+    model, expert = policy.model, policy.model.vlm_with_expert.lm_expert
     hidden = _embedded(policy, noisy, times).flatten(0, 1)  # (B * chunk, expert width)
-    every = vlm.self_attn_every_n_layers
-    for index, layer in enumerate(expert.layers):
-        is_self = "cross" not in vlm.attention_mode or (every > 0 and index % every == 0)
-        part, norm, prefix = layer.self_attn, layer.input_layernorm, stored[:, index].transpose(0, 1)
-        if is_self:
-            shared, inward = to_self, (part.q_proj, part.k_proj, part.v_proj)
-        else:
-            shared, inward, prefix = to_prefix, (part.q_proj,), _projected(prefix, part)
+    for index, (layer, (shared, prefix)) in enumerate(zip(expert.layers, layers, strict=True)):
+        part, norm = layer.self_attn, layer.input_layernorm
+        inward = (part.q_proj, part.k_proj, part.v_proj) if _is_self(policy, index) else (part.q_proj,)
         weights = (each.weight for each in (norm, *inward, part.o_proj))
         hidden = _Attention.apply(hidden, norm.variance_epsilon, prefix, shared, *weights)
         mlp, norm = layer.mlp, layer.post_attention_layernorm

@@ -7,7 +7,9 @@ its gradients equal those of `SmolVLAPolicy.forward`.
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,26 +80,31 @@ def squared_errors(bundle: Bundle, batch: dict[str, Any], noise: torch.Tensor, t
     policy, width = bundle.policy, bundle.policy.config.action_feature.shape[0]
     actions = policy.prepare_action({ACTION_KEY: bundle.normalise_actions(batch[ACTION_KEY])})  # padded like the noise
     mixed = times[:, None, None] * noise + (1 - times[:, None, None]) * actions
-    squared = ((noise - actions)[..., :width] - _velocity(bundle, batch[PREFIX_KEY], mixed, times, width)).square()
+    found = _velocity(bundle, batch[PREFIX_KEY], width)(mixed, times)
+    squared = ((noise - actions)[..., :width] - found).square()
     return squared * ~batch["action_is_pad"].to(noise.device)[..., None]
 
 
 @torch.no_grad()
 def denoise(bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
     """Return the policy's action chunks for this noise, as `predict_action_chunk`: (B, chunk, 6) in degrees."""
-    config, whole = bundle.policy.config, noise.shape[-1]
-    chunk = euler_integrate(lambda x, t: _velocity(bundle, prefix, x, t, whole), noise, config.num_steps)
+    config = bundle.policy.config
+    chunk = euler_integrate(_velocity(bundle, prefix, noise.shape[-1]), noise, config.num_steps)
     return bundle.postprocess(chunk[..., : config.action_feature.shape[0]])
 
 
-def _velocity(
-    bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], noisy: torch.Tensor, times: torch.Tensor, width: int
-) -> torch.Tensor:
-    stored, real = (part.to(noisy.device) for part in prefix)
-    if bundle.is_lean and not torch.is_autocast_enabled(noisy.device.type):  # its derivatives are float32
-        return lean_expert.velocity(bundle.policy, stored, real, noisy, times, width)
-    cache = DynamicCache([each.unbind(1) for each in stored.unbind(1)])
-    return bundle.policy.model.denoise_step(real, cache, noisy, times)[..., :width]
+def _velocity(bundle: Bundle, prefix: tuple[torch.Tensor, torch.Tensor], width: int) -> Callable[..., torch.Tensor]:
+    """Return the first `width` dimensions of the flow's velocity after prefixes, as a function of chunks and times."""
+    policy = bundle.policy
+    stored, real = (part.to(policy.config.device) for part in prefix)
+    if bundle.is_lean and not torch.is_autocast_enabled(stored.device.type):  # its derivatives are float32
+        return partial(lean_expert.velocity, policy, lean_expert.prepared(policy, stored, real), width=width)
+
+    def own(noisy: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+        cache = DynamicCache([each.unbind(1) for each in stored.unbind(1)])
+        return policy.model.denoise_step(real, cache, noisy, times)[..., :width]
+
+    return own
 
 
 def ensure_prefixes(
