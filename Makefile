@@ -4,6 +4,7 @@
 # make new-chapter NAME=12_force     a chapter from the template            make check-site  every page in a browser
 # make zip    notebooks, results and library in one file                    make pdf       the rendered book as a PDF
 # make test-full-size, make test-gpu   the profile gpu with random weights, on the CPU or on a card
+# make test-network   a federation in bad weather, each node on a host of its own (Linux, as root)
 # make check-zip   every chapter as a reader of the zip runs it (make book FROM_ZIP=1 does it too)
 # make sbom, make audit   the locked packages as a bill of materials; known advisories about them (needs the network)
 # make address URL=https://github.com/OWNER/REPOSITORY   the repository's address wherever it belongs (PAGES_URL=...)
@@ -16,7 +17,7 @@
 # `make book` executes at a time) and FEDVLA_JOBS (what else is done at a time); default of both: one per core.
 # TEST_WORKERS is one more than cores, since Flower's tests wait for each other, unless memory is short.
 .DEFAULT_GOAL := help
-.PHONY: help env address audit book sbom check-site check-zip data doctor test test-full-size test-gpu lint lab lock new-chapter zip pdf clean
+.PHONY: help env address audit book sbom check-site check-zip data doctor test test-full-size test-gpu test-network lint lab lock new-chapter zip pdf clean
 .DELETE_ON_ERROR:
 
 PYTHON ?= python3
@@ -147,6 +148,9 @@ test-full-size: $(STAMP)
 
 test-gpu: $(STAMP)
 	$(BIN)/pytest -m gpu -s
+
+test-network: $(STAMP)
+	$(BIN)/pytest -m network -s -rs
 
 lock: $(UV)
 	$(UV) pip compile --quiet --universal --python-version 3.12 --all-extras --generate-hashes --no-annotate \

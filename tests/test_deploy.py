@@ -18,6 +18,7 @@ import psutil
 import pytest
 import yaml
 from cryptography import x509
+from cryptography.x509 import verification
 from flwr.app import RecordDict
 from safetensors.numpy import load_file
 
@@ -382,6 +383,20 @@ def test_a_servers_certificate_also_names_it_as_its_own_helper_calls_it(tmp_path
     named = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert named.get_values_for_type(x509.DNSName) == ["server.example.org", "localhost"]
     assert [str(address) for address in named.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("hours", "is_trusted"), [(-1, True), (1, True), (24 * 8, False), (-25, False)])
+def test_a_clock_that_is_an_hour_off_still_trusts_the_server(tmp_path, hours, is_trusted):
+    files = credentials.make_server(tmp_path, ["server.example.org"])
+    authority, server = (
+        x509.load_pem_x509_certificate(path.read_bytes()) for path in (files.authority, files.certificate)
+    )
+    clock = datetime.now(UTC) + timedelta(hours=hours)
+    policy = verification.PolicyBuilder().store(verification.Store([authority])).time(clock)
+    verifier = policy.build_server_verifier(x509.DNSName("server.example.org"))
+    with contextlib.nullcontext() if is_trusted else pytest.raises(verification.VerificationError):
+        assert verifier.verify(server, []) == [server, authority]
 
 
 @pytest.mark.unit

@@ -34,7 +34,7 @@ RESULTS_ON = {
         "start_up",
     ],
     "book/scale.md": ["scale", "secure_aggregation", "soak"],
-    "book/deployment.md": ["attacks"],
+    "book/deployment.md": ["network", "attacks"],
     "book/costs.md": ["operations"],
 }  # fmt: skip
 TITLES = {
@@ -42,6 +42,7 @@ TITLES = {
     "floor": "the floor",
     "soak": "a long run",
     "attacks": "attacks tried",
+    "network": "in bad weather",
 }
 BENCHMARKS = "benchmarks/results"
 
@@ -157,6 +158,8 @@ def _cores(count: int) -> str:
 def _number(value: object) -> str:
     if value is None:
         return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if not isinstance(value, float):
         return str(value)
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -87,7 +87,9 @@ class SuperLink:
 
 
 @contextmanager
-def local_superlink(home: Path, *options: str, files: ServerFiles | None = None) -> Iterator[SuperLink]:
+def local_superlink(
+    home: Path, *options: str, files: ServerFiles | None = None, host: str = "127.0.0.1"
+) -> Iterator[SuperLink]:
     """Start a SuperLink on a free port of this machine, with `home` as FLWR_HOME, and stop it at the end.
 
     If this process is killed, all that was started with that home ends too.
@@ -95,6 +97,7 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
     Args:
         options: of ``flower-superlink``, such as ``--simulation``.
         files: certificates; without them the connection is not encrypted.
+        host: address on which it listens.
 
     Raises:
         FlowerRunError: the SuperLink did not answer within two minutes.
@@ -107,7 +110,7 @@ def local_superlink(home: Path, *options: str, files: ServerFiles | None = None)
     if files:
         protection = ["--ssl-ca-certfile", str(files.authority), "--ssl-certfile", str(files.certificate)]
         protection += ["--ssl-keyfile", str(files.key)]
-    command = ["flower-superlink", *protection, *options, "--host", "127.0.0.1", "--port", str(port)]
+    command = ["flower-superlink", *protection, *options, "--host", host, "--port", str(port)]
     with guarded(home), warm_start(flower_environment(home), home / "fork_server.log") as environment:
         process = start(command, environment, log := home / "superlink.log")
         try:
