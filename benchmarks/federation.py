@@ -6,7 +6,6 @@ python benchmarks/federation.py
 import argparse
 import json
 import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +38,7 @@ def main() -> None:
 
 def compared(rounds: int, chosen: argparse.Namespace) -> dict[str, float]:
     """Measure federations of `rounds` rounds, of one client and of many."""
-    one, many = (in_own_process(count, rounds, chosen.profile) for count in (1, chosen.clients))
+    one, many = (in_own_process(count, rounds, chosen) for count in (1, chosen.clients))
     return {
         "clients": chosen.clients,
         "rounds": rounds,
@@ -54,9 +53,10 @@ def compared(rounds: int, chosen: argparse.Namespace) -> dict[str, float]:
     }
 
 
-def in_own_process(count: int, rounds: int, profile: str) -> dict[str, float]:
+def in_own_process(count: int, rounds: int, chosen: argparse.Namespace) -> dict[str, float]:
     """Measure a federation of `count` clients."""
-    command = [sys.executable, __file__, "--alone", str(count), "--rounds", str(rounds), "--profile", profile]
+    measured = ["--alone", str(count), "--rounds", str(rounds), "--profile", chosen.profile]
+    command = [chosen.python, __file__, *measured]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 

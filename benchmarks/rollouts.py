@@ -43,10 +43,13 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=int, default=rollouts.AT_ONCE, help="environments that lerobot-eval runs at once"
     )
+    parser.add_argument(
+        "--cores", type=int, nargs="+", default=sorted({1, granted_cores()}), help="numbers of cores to use"
+    )
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
     torch.set_num_threads(1)
-    report("rollouts", [compared(chosen, config, jobs) for jobs in sorted({1, granted_cores()})], chosen.out)
+    report("rollouts", [compared(chosen, config, jobs) for jobs in chosen.cores], chosen.out)
 
 
 def compared(chosen: Namespace, config: Config, jobs: int) -> dict[str, Any]:
@@ -95,7 +98,7 @@ def ours(actor: SameNoise, config: Config, task: str, seeds: list[int], jobs: in
 def lerobot_eval(chosen: Namespace, config: Config, folder: Path, own_processes: bool) -> tuple[float, list[bool]]:
     """Run LeRobot's command; return the seconds that it reports, and the success of each rollout."""
     command = [
-        sys.executable, __file__, AS_LEROBOT, f"--policy.path={export(chosen.policy, str(folder / 'policy'))}",
+        chosen.python, __file__, AS_LEROBOT, f"--policy.path={export(chosen.policy, str(folder / 'policy'))}",
         "--policy.device=cpu", "--env.type=so100_sim", f"--env.task={chosen.task}",
         f"--env.image_size={config.image_size}",
         f"--eval.n_episodes={chosen.rollouts}", f"--eval.batch_size={chosen.batch}", f"--seed={FIRST_SEED}",

@@ -81,8 +81,8 @@ def test_without_a_card_nothing_is_measured_and_nothing_fails(tmp_path, warm_pyt
     assert done.returncode == 0 and done.stdout.startswith("no card") and not list(tmp_path.iterdir())
 
 
-def test_a_federation_is_measured_against_its_clients(run):
-    (row,) = run("federation", "--clients", "2", "--rounds", "1")
+def test_a_federation_is_measured_against_its_clients(run, warm_python):
+    (row,) = run("federation", "--clients", "2", "--rounds", "1", "--python", warm_python)
     assert row["wall time [s]"] >= row["clients' training and evaluation [s]"] > 0
     assert row["peak memory [MB]"] > 0
 
@@ -115,8 +115,8 @@ def test_rounds_are_timed_for_each_number_of_clients(run):
     assert [row["against fewer clients"] for row in rows] == [None, pytest.approx(many / few)]
 
 
-def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path, run):
+def test_rollouts_use_the_same_seeds_as_lerobot_eval(tmp_path, run, warm_python):
     model.save_policy(model.load_policy(from_profile("tiny")), tmp_path / "policy")
-    arguments = ["--policy", str(tmp_path / "policy"), "--rollouts", "2", "--batch", "2"]
-    for row in run("rollouts", *arguments):
-        assert row["rollouts"] == 2 and row["seeds that agree"] == 2
+    arguments = ["--policy", str(tmp_path / "policy"), "--rollouts", "2", "--batch", "2", "--cores", "1"]
+    (row,) = run("rollouts", *arguments, "--python", warm_python)
+    assert row["rollouts"] == 2 and row["seeds that agree"] == 2

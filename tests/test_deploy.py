@@ -31,7 +31,6 @@ from fedvla_lib.config import from_profile, to_run_config
 from fedvla_lib.data import record
 from fedvla_lib.engines import credentials, deployment, guard, processes, superlink
 from fedvla_lib.engines.inline import run_inline
-from fedvla_lib.engines.warm_start import FORK_SERVER
 from fedvla_lib.federation import client, client_app
 from fedvla_lib.files import write_json
 
@@ -259,15 +258,6 @@ def test_a_deployment_goes_on_with_a_run_that_another_engine_began(standing, tin
     assert main(["deploy", "--resume", str(begun), "--tls", "--auth"]) == 2
     said = capsys.readouterr()
     assert "is a completed run" in said.err and said.err.count("\n") == 1 and not said.out
-
-
-def test_a_deployment_goes_on_when_its_fork_servers_are_killed(standing, tiny):
-    """Each program is then started in the ordinary way."""
-    servers = [one for one in psutil.Process().children() if str(FORK_SERVER) in one.cmdline()]
-    for server in servers:
-        server.kill()
-    standing.run(replace(tiny, num_server_rounds=1), 540)
-    assert servers and len(run_folder.read_metrics(max(run_folder.run_folders(tiny)), "train")) == 2
 
 
 @pytest.mark.unit

@@ -1,5 +1,6 @@
 """`flwr run` for real: a SuperLink, Flower's simulation runtime with its Ray workers, and this app."""
 
+import contextlib
 import os
 import re
 import shutil
@@ -22,7 +23,7 @@ from conftest import assert_faults_were_survived
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile, from_run_config
-from fedvla_lib.engines import app_bundle, simulation
+from fedvla_lib.engines import app_bundle, simulation, superlink
 from fedvla_lib.engines.inline import run_inline
 from fedvla_lib.federation import client_app
 
@@ -43,6 +44,17 @@ def tiny(recording, tmp_path):
         num_threads=1,
         out=str(tmp_path / "outputs"),
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_link(tmp_path_factory):
+    """All simulations of this file run on one SuperLink, instead of one each."""
+    with (
+        superlink.local_superlink(tmp_path_factory.mktemp("link"), "--simulation") as link,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr(simulation, "local_superlink", lambda *_: contextlib.nullcontext(link))
+        yield
 
 
 def forget(message, context, call_next):

@@ -134,7 +134,7 @@ def test_other_systems_and_long_paths_start_processes_in_the_ordinary_way(tmp_pa
 
 @pytest.mark.integration
 @pytest.mark.slow
-def test_the_servers_load_pytorch_but_not_this_library_and_are_safe_to_fork(tmp_path):
+def test_the_servers_load_pytorch_but_not_this_library_and_are_safe_to_fork_and_to_kill(tmp_path):
     """An app brings its own copy of the library, which a copy in memory would hide."""
     (tmp_path / "script.py").write_text(
         "import sys, threading, torch\n"
@@ -146,4 +146,13 @@ def test_the_servers_load_pytorch_but_not_this_library_and_are_safe_to_fork(tmp_
         command = [stand_in(environment, warm_start.PYTHON), str(tmp_path / "script.py")]
         said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
         assert said == "[] True 1 False\n"
-        assert set(os.listdir(Path(command[0]).parent)) >= {"flwr", "flwr-clientapp", "flower-superexec"}
+        programs = {"flwr", "flwr-clientapp", "flwr-serverapp", "flwr-simulation", "flower-superexec"}
+        assert set(os.listdir(Path(command[0]).parent)) >= programs
+        servers = [one for one in psutil.Process().children() if str(warm_start.FORK_SERVER) in one.cmdline()]
+        for server in servers:
+            server.kill()
+        assert len(servers) == 2 and not psutil.wait_procs(servers, timeout=10)[1]
+        for name in programs:  # each is then started in the ordinary way
+            command = [stand_in(environment, name), "--help"]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True)
+            assert done.returncode == 0 and "usage" in done.stdout.lower(), done.stderr
