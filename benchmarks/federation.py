@@ -6,6 +6,7 @@ python benchmarks/federation.py
 import argparse
 import json
 import subprocess
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--clients", type=int, default=10, help="number of clients")
     parser.add_argument("--rounds", type=int, nargs="+", default=[2, 10], help="numbers of rounds")
+    parser.add_argument("--python", default=sys.executable, help="what runs a measurement in a process of its own")
     parser.add_argument("--alone", type=int, help="used internally: run with this many clients and print the numbers")
     chosen = parser.parse_args()
     config = replace(laptop(chosen.profile), eval_rollouts=0, eval_every=0)

@@ -28,7 +28,6 @@ def options(text: str) -> argparse.ArgumentParser:
     parser.add_argument("--profile", default="laptop", choices=list(PROFILES), help="profile of model and data")
     parser.add_argument("--repeats", type=int, default=5, help="measurements on each side; the median is reported")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the JSON file")
-    parser.add_argument("--python", default=sys.executable, help="what runs federation.py's and rollouts.py's processes")
     return parser
 
 

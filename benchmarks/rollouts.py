@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=int, default=rollouts.AT_ONCE, help="environments that lerobot-eval runs at once"
     )
+    parser.add_argument("--python", default=sys.executable, help="what runs a measurement in a process of its own")
     parser.add_argument(
         "--cores", type=int, nargs="+", default=sorted({1, granted_cores()}), help="numbers of cores to use"
     )
