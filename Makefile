@@ -140,7 +140,7 @@ test: export COVERAGE_CORE := sysmon
 test: doctor lint
 	$(BIN)/pytest -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 --cov --cov-report term \
 	  --cov-report xml:_build/tests/coverage.xml --junitxml _build/tests/junit.xml
-	$(BIN)/python book/tools/check_zip.py --only 02_ 05_ -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
+	$(BIN)/python book/tools/check_zip.py --only 10_ 90_ -n $(TEST_WORKERS) --dist loadfile --junitxml "$(CURDIR)/_build/tests/junit-notebooks.xml"
 
 # The profile `gpu` with random weights: on the CPU, which takes 9 GB and up to half an hour, or on a card.
 test-full-size: $(STAMP)

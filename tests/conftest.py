@@ -18,6 +18,8 @@ os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 os.environ.setdefault("MPLBACKEND", "agg")
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,20 @@ def assert_faults_were_survived(root: Path, config) -> None:
     inline = run_inline(config, clients_app=app, progress=False)
     left, right = (load_file(one / "global_model/round_2/model.safetensors") for one in (root, inline))
     assert left.keys() == right.keys() and max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6
+
+
+@contextmanager
+def short_rollouts() -> Iterator[None]:
+    """Rollouts take two simulated seconds, where they are counted and how they end does not matter.
+
+    An expert needs all of its time: recordings have to be there before.
+    """
+    from fedvla_lib.robot import tasks
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, task in tasks.ALL_TASKS.items():
+            patch.setitem(tasks.ALL_TASKS, name, replace(task, horizon_steps=20))
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

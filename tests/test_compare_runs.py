@@ -7,6 +7,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
+from conftest import short_rollouts
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
 from fedvla_lib.config import from_profile
@@ -25,9 +26,10 @@ def runs(recording, tmp_path_factory):
     )  # fmt: skip
     settings = {"fedavg": {}, "median": {"strategy": "fedmedian"}, "longer": {"local_steps": 3}}
     folders = {}
-    for name, own in settings.items():
-        made = inline.run_inline(replace(tiny, out=str(out), **own), progress=False)
-        folders[name] = made.rename(out / name)
+    with short_rollouts():
+        for name, own in settings.items():
+            made = inline.run_inline(replace(tiny, out=str(out), **own), progress=False)
+            folders[name] = made.rename(out / name)
     return folders
 
 

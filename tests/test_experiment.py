@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import faulty
+from conftest import short_rollouts
 from fedvla_book import tables
 from fedvla_book.tables import results
 from fedvla_lib import run_folder
@@ -124,9 +125,10 @@ def test_finished_cells_are_kept_and_say_what_they_cost(recording, tmp_path, cap
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
     plan = read_plan(file)
-    experiment.run_plan(Plan(plan.cells[:2], plan.rollout_seeds), out)
-    before = {path.name: (path / "stamp.json").stat().st_mtime_ns for path in out.iterdir()}
-    assert main(["experiment", str(file), "--out", str(out)]) == 0
+    with short_rollouts():
+        experiment.run_plan(Plan(plan.cells[:2], plan.rollout_seeds), out)
+        before = {path.name: (path / "stamp.json").stat().st_mtime_ns for path in out.iterdir()}
+        assert main(["experiment", str(file), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "5 cells, 2 of them in" in said
     assert all((out / name / "stamp.json").stat().st_mtime_ns == time for name, time in before.items())
@@ -222,7 +224,8 @@ def test_no_method_trains_on_a_held_out_episode_and_all_make_the_same_new_rollou
     shown = {demonstration_seed(0, i, rollout) for i in range(len(store.episodes)) for rollout in range(MAX_ATTEMPTS)}
     for kind, expected in {"federated": own, "local-only": own, "centralized": [whole]}.items():
         handed_out.clear()
-        found = experiment.MEASURES[kind](config, seeds)
+        with short_rollouts():
+            found = experiment.MEASURES[kind](config, seeds)
         trained = sorted(map(list, set(map(tuple, handed_out))))
         assert trained == expected, kind
         assert not {episode for part in trained for episode in part} & set(held_out), kind
@@ -239,7 +242,8 @@ def test_a_cell_is_a_run_that_can_be_compared_and_keeps_its_rounds(recording, tm
              "eval_rollouts = 1", "[methods.pooled]", "kind = 'centralized'"]  # fmt: skip
     file, out = tmp_path / "grid.toml", tmp_path / "out"
     file.write_text("\n".join(lines))
-    assert main(["experiment", str(file), "--out", str(out)]) == 0
+    with short_rollouts():
+        assert main(["experiment", str(file), "--out", str(out)]) == 0
     rounds = run_folder.read_metrics(out / "mixed_averaged_0", "evaluate")
     curve = tables.read_rounds(out)
     assert list(curve["round"]) == [0, 1, 2] and list(curve.n) == [2, 2, 4] and curve.steps.iloc[-1] == 8

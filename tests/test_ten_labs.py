@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from conftest import short_rollouts
 from fedvla_book.tables.results import read_results, summary
 from fedvla_lib import run_folder
 from fedvla_lib.cli.main import main
@@ -62,7 +63,10 @@ def grid(tmp_path_factory):
     root = tmp_path_factory.mktemp("ten labs")
     lines = [f"{name} = {json.dumps(value)}" for name, value in (SETTINGS | {"fraction_train": 1.0}).items()]
     (root / "grid.toml").write_text(GRID % "\n".join(lines))
-    assert main(["experiment", str(root / "grid.toml"), "--out", str(root / "out")]) == 0
+    for seed in (0, 10_000):  # of the labs' demonstrations and of fresh ones
+        recordings.open_frames(from_profile("tiny", **SETTINGS, seed=seed))
+    with short_rollouts():
+        assert main(["experiment", str(root / "grid.toml"), "--out", str(root / "out")]) == 0
     return root
 
 
