@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from conftest import heed_interrupts
 from fedvla_lib.engines import processes, superlink, warm_start
 
 SCRIPT = """
@@ -91,6 +92,30 @@ def test_a_signal_reaches_the_fork(calls):
     child = [process.stdout.readline(), int(process.stdout.readline())][1]
     process.terminate()
     assert process.wait(10) == 9 and gone(child)
+
+
+@pytest.fixture
+def without_interrupts():
+    """As a shell starts what it runs in the background: the fork server inherits it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("heeds", [True, False])
+def test_a_fork_ignores_an_interrupt_if_its_caller_does_whatever_the_server_does(without_interrupts, calls, heeds):
+    with pytest.MonkeyPatch.context() as patch:
+        started = subprocess.Popen
+        patch.setattr(subprocess, "Popen", lambda *words, **rest: started(
+            *words, **rest, preexec_fn=heed_interrupts if heeds else None
+        ))  # fmt: skip
+        process = calls[0]()
+    assert json.loads(process.stdout.readline())
+    process.send_signal(signal.SIGINT)
+    if heeds:
+        assert process.wait(10) == 128 + signal.SIGINT
+    else:
+        assert process.communicate("\n", timeout=10) and process.returncode == 1
 
 
 def test_a_fork_and_its_children_end_with_the_call_also_when_the_server_is_gone(calls):

@@ -27,17 +27,18 @@ STARTED = b"started\n"
 def call(address: str, command: list[str]) -> int:
     """Run a script in a fork of the server and return its exit status, 128 + n if it was ended by signal n."""
     connection = socket.socket(socket.AF_UNIX)
+    ignored = [number for number in SIGNALS if signal.getsignal(number) == signal.SIG_IGN]  # as nohup has it
     try:
         connection.connect(address)
         socket.send_fds(connection, [b"!"], [0, 1, 2])
-        connection.sendall(json.dumps([os.getcwd(), dict(os.environ), command]).encode() + b"\n")
+        connection.sendall(json.dumps([os.getcwd(), dict(os.environ), command, ignored]).encode() + b"\n")
         answer = connection.makefile("rb")
         started = answer.readline() == STARTED
     except OSError:
         started = False
     if not started:  # the server was killed
         os.execv(sys.executable, [sys.executable, *command])
-    for number in SIGNALS:
+    for number in set(SIGNALS) - set(ignored):
         signal.signal(number, lambda number, _: connection.sendall(bytes([number])))
     return int(answer.readline() or 1)
 
@@ -69,7 +70,7 @@ def _answer(connection: socket.socket) -> list[str]:
     """Fork the process that runs the command, and watch over it; return only in that process."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     _, files, *_ = socket.recv_fds(connection, 1, 3)
-    folder, environment, command = json.loads(connection.makefile("rb").readline())
+    folder, environment, command, ignored = json.loads(connection.makefile("rb").readline())
     if child := os.fork():
         _watch(connection, child)
         os._exit(0)
@@ -77,6 +78,9 @@ def _answer(connection: socket.socket) -> list[str]:
     for number, file in enumerate(files):
         os.dup2(file, number)
         os.close(file)
+    for number in SIGNALS:  # the server may ignore others than the caller
+        usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN if number in ignored else usual)
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
