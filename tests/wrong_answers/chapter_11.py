@@ -47,6 +47,7 @@ WRONG = {
         (ROWS.format("np.arange(0, frames, 2)"), "Take the times"),
         (ROWS.format("np.floor(np.arange(0, frames, recorded / fps)) - (recorded == 25)"), "nearest one"),
         (ROWS.format("np.arange(0, frames, 3)[:, None]"), "list of row numbers"),
+        (ROWS.format("np.round(np.arange(0, frames, recorded / fps)).astype(int)"), "no row 8"),
     ],
     "zero_offset": [
         (OFFSET.format("moved"), "never starts in quite the same pose"),

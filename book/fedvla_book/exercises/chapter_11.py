@@ -40,6 +40,7 @@ def rows_at(rows: Callable[[int, float, float], np.ndarray]) -> None:
     uneven = np.asarray(rows(10, 25.0, 10.0))
     expect(not close(uneven, [0, 2, 4, 6, 8]), "25 / 10 is no whole number: round each time's row, not the step.")
     expect(close(uneven, [0, 2, 5, 8]) or close(uneven, [0, 3, 5, 8]), "The frame for a time is the nearest one.")
+    expect(np.max(rows(8, 25.0, 10.0)) < 8, "There is no row 8 in an episode of 8 frames: the last one is the nearest.")
 
 
 def zero_offset(offset: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
