@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,10 +39,13 @@ def refusal() -> str:
     if not shutil.which("ip") or not DEVICE.exists():
         return f"network namespaces need the program ip, and {DEVICE}"
     probe = f"fedvla-probe-{os.getpid()}"
-    for words in (["add", probe], ["exec", probe, "true"], ["del", probe]):
-        done = subprocess.run(["ip", "netns", *words], capture_output=True, text=True)
-        if done.returncode:
-            return f"ip netns {' '.join(words)}: {done.stderr.strip()}"
+    try:
+        for words in (["add", probe], ["exec", probe, "true"]):
+            done = subprocess.run(["ip", "netns", *words], capture_output=True, text=True)
+            if done.returncode:
+                return f"ip netns {' '.join(words)}: {done.stderr.strip()}"
+    finally:
+        subprocess.run(["ip", "netns", "del", probe], capture_output=True)
     return ""
 
 
@@ -82,6 +85,8 @@ class Line(threading.Thread):
         bytes_per_s: each way; 0 is without a limit.
         is_cut: nothing arrives.
         carried: bytes delivered to the right host, and to the left.
+        lost: packets that did not arrive, whatever the reason.
+        late: packets that waited for others to pass a narrow line.
     """
 
     def __init__(self, number: int, left: Host, right: Host) -> None:
@@ -89,6 +94,7 @@ class Line(threading.Thread):
         super().__init__(daemon=True)
         self.address = f"10.77.{number}.1"
         self.carried, self._free_at, self._rng = [0, 0], [0.0, 0.0], random.Random(number)
+        self.lost = self.late = 0
         self._due: list[tuple[float, int, int, bytes]] = []
         self._order, self._closing = itertools.count(), threading.Event()
         self._ends = [host.call(lambda name=f"line{number}": _tun(name)) for host in (left, right)]
@@ -109,8 +115,10 @@ class Line(threading.Thread):
                 self._take(1 - self._ends.index(end), os.read(end, PACKET))
             while self._due and self._due[0][0] <= time.monotonic():
                 _, _, to, packet = heapq.heappop(self._due)
-                with suppress(BlockingIOError):  # the device is full: lost, as in a router
+                try:
                     self.carried[1 - to] += os.write(self._ends[to], packet)
+                except BlockingIOError:  # the device is full: lost, as in a router
+                    self.lost += 1
         for end in self._ends:
             os.close(end)
 
@@ -118,14 +126,17 @@ class Line(threading.Thread):
         now = time.monotonic()
         sent_at = max(now, self._free_at[to]) + (len(packet) / self.bytes_per_s if self.bytes_per_s else 0.0)
         if self.is_cut or self._rng.random() < self.loss or sent_at - now > BACKLOG_S:
+            self.lost += 1
             return
+        self.late += self._free_at[to] > now
         self._free_at[to] = sent_at
         heapq.heappush(self._due, (sent_at + self.delay_s, next(self._order), to, packet))
 
     def close(self) -> None:
         """Stop, and remove the devices."""
         self._closing.set()
-        self.join()
+        if self.is_alive():
+            self.join()
 
 
 def _tun(name: str) -> int:

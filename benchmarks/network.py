@@ -3,18 +3,22 @@
     python benchmarks/network.py --profile tiny        as root, on Linux
 
 Most cases are runs of two rounds that start on a good network, which gets worse when clients begin to train. Such a run
-is as good as undisturbed if its model is that of the inline engine, which has no network.
+is as good as undisturbed if its model is that of the inline engine, which has no network. A promise counts as kept only
+if the lines say that the weather struck: packets were lost or late, and each node's traffic went through its line.
 """
 
 import re
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -28,14 +32,16 @@ from fedvla_lib.engines import credentials, deployment, processes, superlink
 from fedvla_lib.engines.inline import run_inline
 from fedvla_lib.engines.warm_start import warm_start
 from hosts import Host, Line, enter, network, refusal
-from report import laptop, options, report, start
+from report import RESULTS, laptop, options, report, start
 
 CLIENTS, ROUNDS, SERVER = 3, 2, "server.example.org"
 TIMEOUT_S = 900.0
 BACK_S = 45.0  # a node reports every half minute
-ONE_PORT = "the server's port, and no other on any host"
+OUTAGE_S = 120.0
+LEAST_BYTES = 1_000_000  # through each line: less than a model
 SAME = f"{ROUNDS} rounds of {CLIENTS} clients, the model of a run without a network"
 GONE = f"{ROUNDS} rounds of {CLIENTS - 1} clients; client_2: silent"
+ONE_PORT = f"the server's port, and no other on any host; {SAME}"
 
 
 @dataclass
@@ -114,10 +120,10 @@ def server_away(remote: Remote, since_s: float, until_s: float) -> None:
         line.is_cut = since_s < until_s
 
 
-def exchanged(remote: Remote, since_s: float) -> None:
+def renew(remote: Remote, _: float) -> None:
     """The certificate and a node's key are replaced on disk, and the new authority is trusted beside the old one."""
-    if not (remote.folder / "new").exists():
-        new, old = credentials.make_server(remote.folder / "new", [SERVER]), remote.link.files
+    if not (remote.folder / "server/new").exists():
+        new, old = credentials.make_server(remote.folder / "server/new", [SERVER]), remote.link.files
         old.authority.write_bytes(old.authority.read_bytes() + new.authority.read_bytes())
         shutil.copy(new.certificate, old.certificate)
         shutil.copy(new.key, old.key)
@@ -127,32 +133,58 @@ def exchanged(remote: Remote, since_s: float) -> None:
 
 def in_weather(remote: Remote, config: Config, alone: Path, weather: Callable[[Remote, float], None]) -> str:
     """Run a federation; the weather is told the seconds since clients began to train. Say what happened."""
-    before, trained = run_folder.run_folders(config), []
+    before, began = run_folder.run_folders(config), []
 
     def watch() -> None:
         root = run_folder.own_run(config, before)
-        if not trained and root and (root / "checkpoints/round_0").is_dir():
-            trained.append(time.monotonic())
-        if trained:
-            weather(remote, time.monotonic() - trained[0])
+        if not began and root and (root / "checkpoints/round_0").is_dir():
+            began.append(datetime.now(UTC))
+        if began:
+            weather(remote, (datetime.now(UTC) - began[0]).total_seconds())
 
     remote.run(config, TIMEOUT_S, watch)
-    return told(run_folder.own_run(config, before), alone)
+    root = run_folder.own_run(config, before)
+    late = not began or began[0] > training_times(root)[0]
+    return told(root, alone) + "; the weather came too late" * late
+
+
+def training_times(root: Path) -> list[datetime]:
+    """Return when the server had the first and the last update of a run."""
+    times = sorted(run_folder.read_metrics(root, "train").time)
+    return [datetime.fromisoformat(times[i]) for i in (0, -1)]
 
 
 def resumed(remote: Remote, config: Config, alone: Path) -> str:
     """Cut the server's host off for longer than Flower waits for anybody, and resume the run on a good network."""
-    before = run_folder.run_folders(config)
+    before, cut = run_folder.run_folders(config), []
+
+    def weather(of: Remote, since_s: float) -> None:
+        cut.append(time.monotonic())
+        server_away(of, since_s, OUTAGE_S)
+
     try:
-        return in_weather(remote, config, alone, partial(server_away, until_s=120))
+        return in_weather(remote, config, alone, weather)
     except processes.FlowerRunError:
         root = run_folder.own_run(config, before)
     status = run_folder.read_stamp(root)["status"]
+    time.sleep(max(0.0, cut[0] + OUTAGE_S - time.monotonic()))
     for line in remote.lines:
         line.mend()
     time.sleep(BACK_S)
-    good = in_weather(remote, replace(config, resume=str(root)), alone, lambda *_: None)
-    return f"{status.split(':')[0]}, and says why; resumed, {good}"
+    again = replace(config, resume=str(root))
+    remote.run(again, TIMEOUT_S)
+    return f"{':'.join(status.split(':')[:2])}; resumed, {told(root, alone)}"
+
+
+def renewed(remote: Remote, config: Config, alone: Path) -> str:
+    """Replace certificate and key during a run, then restart that node, which runs with its new key."""
+    first = in_weather(remote, config, alone, renew)
+    if not (remote.folder / "server/new").exists():
+        return "nothing was replaced"
+    processes.stop(remote.nodes[1])
+    remote.launch_node(1)
+    remote.wait_for_node(1)
+    return f"{first}; node restarted, {in_weather(remote, config, alone, lambda *_: None)}"
 
 
 def nameless(remote: Remote, config: Config, alone: Path) -> str:
@@ -161,56 +193,71 @@ def nameless(remote: Remote, config: Config, alone: Path) -> str:
     remote.hosts[0].know({})
     remote.launch_node(0)
     time.sleep(20)
-    early = deployment.CONNECTED in remote.log(0).read_text()
+    said = remote.log(0).read_text()
+    tries = "Connection attempt failed" in said and deployment.CONNECTED not in said and remote.nodes[0].poll() is None
     remote.resolve(0)
     remote.wait_for_node(0)
-    return "joins too early" if early else f"joins; {in_weather(remote, config, alone, lambda *_: None)}"
+    return f"joins; {in_weather(remote, config, alone, lambda *_: None)}" if tries else "the name was not missed"
 
 
 def twice(remote: Remote, config: Config, alone: Path) -> str:
     """Run a second federation with a SuperLink and SuperNodes of its own on the same hosts, at the same time."""
 
-    def one(of: Remote, name: str) -> str:
-        return in_weather(of, replace(config, out=f"{config.out}_{name}"), alone, lambda *_: None)
+    def one(of: Remote, name: str) -> tuple[str, list[datetime]]:
+        own = replace(config, out=f"{config.out}_{name}")
+        said = in_weather(of, own, alone, lambda *_: None)
+        return said, training_times(max(run_folder.run_folders(own)))
 
     with (
         federation(remote.folder / "second", remote.hosts, remote.lines, remote.centre) as second,
         ThreadPoolExecutor(2) as threads,
     ):
-        said = list(threads.map(one, (remote, second), ("first", "second")))
-    return said[0] if said[0] == said[1] else "; ".join(said)
+        (said, times), (other, others) = threads.map(one, (remote, second), ("first", "second"))
+    together = max(times[0], others[0]) < min(times[1], others[1])
+    return (said if said == other else f"{said}; {other}") + "; one after the other" * (not together)
 
 
-def listening(remote: Remote, *_: object) -> str:
-    """List the ports that others can reach, on the server's host and on those of the nodes."""
-    found = [sockets(remote.centre), *map(sockets, remote.hosts)]
-    of_server = [port for port in found[0] if port != remote.link.port]
-    others = [port for ports in [of_server, *found[1:]] for port in ports]
-    return f"others open: {others}" if others or remote.link.port not in found[0] else ONE_PORT
+def listening(remote: Remote, config: Config, alone: Path) -> str:
+    """List the ports that others can reach while a run goes on, on the server's host and on those of the nodes."""
+    found: dict[str, set[int]] = {host.name: set() for host in (remote.centre, *remote.hosts)}
+
+    def look(of: Remote, _: float) -> None:
+        for host in (of.centre, *of.hosts):
+            found[host.name].update(sockets(host))
+
+    said = in_weather(remote, config, alone, look)
+    server = found.pop(remote.centre.name)
+    others = [*server - {remote.link.port}, *(port for ports in found.values() for port in ports)]
+    one = remote.link.port in server and not others
+    return f"the server's port, and {'no other on any host' if one else f'others: {others}'}; {said}"
 
 
 def sockets(host: Host) -> list[int]:
-    """Return the ports on which a host listens, loopback aside."""
-    lines = host.call(lambda: subprocess.run(["ss", "-ltnH"], capture_output=True, text=True, check=True).stdout)
-    places = [line.split()[3].rpartition(":") for line in lines.splitlines()]
+    """Return the ports, of TCP and UDP, on which a host listens, loopback aside."""
+    lines = host.call(lambda: subprocess.run(["ss", "-ltunH"], capture_output=True, text=True, check=True).stdout)
+    places = [line.split()[4].rpartition(":") for line in lines.splitlines()]
     return [int(port) for address, _, port in places if not address.startswith(("127.", "[::1]"))]
 
 
 Happens = Callable[[Remote, Config, Path], str]
-# What the network does: what is promised, and what shows what happens. A run's weather begins when its clients train.
-CASES: dict[str, tuple[str, Happens]] = {
-    "good": (SAME, partial(in_weather, weather=lambda *_: None)),
-    "0.1 s each way, 5 % of packets lost": (SAME, partial(in_weather, weather=slow)),
-    "1 Mbit/s each way": (SAME, partial(in_weather, weather=narrow)),
-    "a node cut off for 20 s in mid-round": (SAME, partial(in_weather, weather=away)),
-    "the server cut off for 20 s in mid-round": (SAME, partial(in_weather, weather=partial(server_away, until_s=20))),
-    "the server cut off for two minutes in mid-round": (f"failed, and says why; resumed, {SAME}", resumed),
-    "a node does not find the server's name for 20 s": (f"joins; {SAME}", nameless),
-    "two federations on the same hosts": (SAME, twice),
-    "certificates and a node's key exchanged in mid-round": (SAME, partial(in_weather, weather=exchanged)),
-    "which ports others can reach": (ONE_PORT, listening),
-    "a node cut off in mid-round, and for good": (GONE, partial(in_weather, weather=gone)),
-}
+# What the network does: what is promised, what shows what happens, and which trace the weather leaves on the lines.
+CASES: dict[str, tuple[str, Happens, str]] = {
+    "good": (SAME, partial(in_weather, weather=lambda *_: None), ""),
+    "0.1 s each way, 5 % of packets lost": (SAME, partial(in_weather, weather=slow), "lost"),
+    "1 Mbit/s each way": (SAME, partial(in_weather, weather=narrow), "late"),
+    "a node cut off for 20 s during a round": (SAME, partial(in_weather, weather=away), "lost"),
+    "the server cut off for 20 s during a round": (
+        SAME, partial(in_weather, weather=partial(server_away, until_s=20)), "lost",
+    ),
+    "the server cut off for two minutes during a round": (f"failed: TooFewReplies; resumed, {SAME}", resumed, "lost"),
+    "a node cannot resolve the server's name for 20 s": (f"joins; {SAME}", nameless, ""),
+    "two federations on the same hosts": (SAME, twice, ""),
+    "the server's certificate and a node's key replaced during a round": (
+        f"{SAME}; node restarted, {SAME}", renewed, "",
+    ),
+    "open ports during a run": (ONE_PORT, listening, ""),
+    "a node cut off during a round, permanently": (GONE, partial(in_weather, weather=gone), "lost"),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -220,6 +267,10 @@ def main() -> None:
     chosen = parser.parse_args()
     if why := refusal():
         raise ValueError(why)
+    if chosen.only != list(CASES) and chosen.out == RESULTS:
+        raise ValueError("--only would leave cases out of the stored table: give another --out")
+    for number in (signal.SIGTERM, signal.SIGHUP):  # as at Ctrl-C, hosts and keys are removed
+        signal.signal(number, lambda *_: sys.exit(1))
     rows: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as name, network(CLIENTS) as (centre, hosts, lines):
         folder = Path(name)
@@ -233,22 +284,32 @@ def main() -> None:
         with federation(folder / "federation", hosts, lines, centre) as remote:
             for case in chosen.only:
                 rows.append({"the network": case, **tried(remote, config, *CASES[case], alone)})
-                report("network", rows, chosen.out)  # each time: the whole takes minutes
+                print(rows[-1], flush=True)
+    report("network", rows, chosen.out)
+    if broken := [row["the network"] for row in rows if not row["kept"]]:
+        raise ValueError(f"not as promised: {', '.join(broken)}")
 
 
-def tried(remote: Remote, config: Config, promised: str, happens: Happens, alone: Path) -> dict[str, object]:
+def tried(
+    remote: Remote, config: Config, promised: str, happens: Happens, trace: str, alone: Path
+) -> dict[str, object]:
     """Return what was promised, what happened, and what it cost."""
+    for line in remote.lines:
+        line.lost = line.late = 0
     carried, began = [sum(line.carried) for line in remote.lines], time.monotonic()
     try:
         happened = happens(remote, config, alone)
     except processes.FlowerRunError as error:
-        happened = str(error)
+        happened = type(error).__name__
     for line in remote.lines:
         line.mend()
     moved = [sum(line.carried) - was for line, was in zip(remote.lines, carried, strict=True)]
+    there = CLIENTS - promised.count("silent")  # one that is gone may have been cut off before its model came
+    struck = sorted(moved)[-there] > LEAST_BYTES and (not trace or any(getattr(line, trace) for line in remote.lines))
     return {
-        "promised": promised, "happened": happened, "kept": happened == promised,
-        "time [s]": time.monotonic() - began, "through a node's line [MB]": max(moved) / 1e6,
+        "promised": promised, "happened": happened, "kept": happened == promised and struck,
+        "time [s]": time.monotonic() - began, "through the busiest line [MB]": max(moved) / 1e6,
+        "packets lost": sum(line.lost for line in remote.lines),
     }  # fmt: skip
 
 
@@ -258,7 +319,7 @@ def told(root: Path, alone: Path) -> str:
     counts = trained.groupby("round").who.nunique()
     said = f"{len(counts)} rounds of {' and '.join(map(str, sorted(set(counts))))} clients"
     left, right = (load_file(one / f"global_model/round_{ROUNDS}/model.safetensors") for one in (root, alone))
-    if max(np.abs(left[name] - right[name]).max() for name in left) <= 1e-6:
+    if left.keys() == right.keys() and all(np.allclose(left[name], right[name], 0, 1e-6) for name in left):
         said += ", the model of a run without a network"
     named = dict.fromkeys(f"{row.who}: {row.reason}" for row in rejected.itertuples())
     return "; ".join([said, *named])

@@ -157,6 +157,35 @@ def refusal(node_of: deployment.Deployment) -> str:
     return node_of.log(0).read_text()
 
 
+OFF = """
+import sys
+from datetime import timedelta
+from flwr.supernode import node_auth_http_interceptor as signing
+from flwr.supernode.cli import flower_supernode
+right, off = signing.now, timedelta(seconds=float(sys.argv.pop(1)))
+signing.now = lambda: right() + off
+flower_supernode()
+"""
+
+
+@pytest.mark.parametrize(("ahead_s", "joins"), [(60, False), (-3600, False), (-240, True)])
+def test_a_node_joins_unless_its_clock_is_ahead_or_minutes_behind(standing, tmp_path, monkeypatch, ahead_s, joins):
+    key, usual = credentials.make_node_key(tmp_path, "late"), deployment.Deployment._command
+    standing.link.ask("supernode", "register", str(key.public), superlink.CONNECTION)
+    monkeypatch.setattr(
+        deployment.Deployment, "_command",
+        lambda here, k: [sys.executable, "-c", OFF, str(ahead_s), *usual(here, k)[1:]],
+    )  # fmt: skip
+    late = replace(standing, keys=[key, key], nodes={}, folder=tmp_path)
+    late.launch_node(0)
+    try:
+        with contextlib.nullcontext() if joins else pytest.raises(processes.FlowerRunError, match="client 0 ended"):
+            late.wait_for_node(0)
+    finally:
+        processes.stop(late.nodes[0])
+    assert (deployment.CONNECTED in late.log(0).read_text()) == joins
+
+
 def test_nodes_and_users_that_trust_another_authority_do_not_talk_to_the_server(standing, tmp_path):
     elsewhere = credentials.make_server(tmp_path / "elsewhere")
     astray = replace(standing, link=replace(standing.link, files=elsewhere), nodes={}, folder=tmp_path)

@@ -42,7 +42,7 @@ TITLES = {
     "floor": "the floor",
     "soak": "a long run",
     "attacks": "attacks tried",
-    "network": "in bad weather",
+    "network": "on a bad network",
 }
 BENCHMARKS = "benchmarks/results"
 
