@@ -44,13 +44,10 @@ def main() -> None:
         "--batch", type=int, default=rollouts.AT_ONCE, help="environments that lerobot-eval runs at once"
     )
     parser.add_argument("--python", default=sys.executable, help="what runs a measurement in a process of its own")
-    parser.add_argument(
-        "--cores", type=int, nargs="+", default=sorted({1, granted_cores()}), help="numbers of cores to use"
-    )
     chosen = parser.parse_args()
     config = laptop(chosen.profile, base=str(chosen.policy))
     torch.set_num_threads(1)
-    report("rollouts", [compared(chosen, config, jobs) for jobs in chosen.cores], chosen.out)
+    report("rollouts", [compared(chosen, config, jobs) for jobs in sorted({1, granted_cores()})], chosen.out)
 
 
 def compared(chosen: Namespace, config: Config, jobs: int) -> dict[str, Any]:

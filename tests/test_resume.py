@@ -87,11 +87,8 @@ def flip(file, position):
 
 
 def start_and_interrupt(python, config, round_number):
-    """Press Ctrl-C while clients train in a round: a terminal sends the signal to the whole group.
-
-    A round earlier than others do: tiny rounds are short, and a busy machine may be late to pass the signal on.
-    """
-    process, root = start_until(python, config, round_number - 1)
+    """Press Ctrl-C while clients train in a round: a terminal sends the signal to the whole group."""
+    process, root = start_until(python, config, round_number)
     os.killpg(process.pid, signal.SIGINT)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 130 and "interrupted: completed rounds are in the run folder" in said

@@ -38,7 +38,7 @@ def test_the_readmes_commands_run_a_federation(recording, tmp_path, monkeypatch,
         eval_rollouts=0, client_rollouts=0, num_threads=1, out=str(tmp_path / "outputs"),
     )  # fmt: skip
     assert main(["superlink", "status"]) == 3
-    for sign in (signal.SIGINT, signal.SIGHUP):
+    for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         interrupt_while_starting(home, sign)
         assert main(["superlink", "status"]) == 3 and not processes_of(home)
     try:
